@@ -61,7 +61,7 @@ def check_positive(*, or_infinite: bool = False, **values: Any) -> None:
 
 
 def check_ranges(**values: Any) -> None:
-    """Raise ``BaseError`` unless each value is two finite numbers ``(low, high)`` with ``0 < low <= high``."""
+    """Raise ``BaseError`` unless each value is a pair of finite numbers ``(low, high)`` with ``0 < low <= high``."""
     for name, value in values.items():
         two_numbers = hasattr(value, "__len__") and len(value) == 2 and all(map(_is_number, value))
         in_order = two_numbers and 0 < value[0] <= value[1]
@@ -71,7 +71,7 @@ def check_ranges(**values: Any) -> None:
 def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
     """Raise ``ShapeError`` when a tensor does not have its expected shape.
 
-    The error message also names the shape of ``like``, the world points.
+    If the world points are given as ``like``, the error message also names their shape.
     """
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
@@ -82,7 +82,7 @@ def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
 
 
 def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise an error when the dtype or the device of a tensor differs from ``like``. ``None`` is not checked.
+    """Raise an error when a tensor has another dtype or device than ``like``. Entries of ``None`` are skipped.
 
     Raises:
         TypeCheckError: when the dtypes differ.
@@ -95,16 +95,16 @@ def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: st
 
 
 def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise ``DeviceError`` when the device of a tensor differs from ``like``. ``None`` is not checked."""
+    """Raise ``DeviceError`` when a tensor is on another device than ``like``. Entries of ``None`` are skipped."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.device != like.device:
             raise DeviceError(f"{name} is on {tensor.device} but {like_name} is on {like.device}.")
 
 
 def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
-    """Find the dtype for computation: float64 when any tensor is float64, else float32. ``None`` does not count.
+    """Choose the dtype of a computation: float64 if any tensor is float64, else float32. ``None`` is ignored.
 
-    Half precision is too coarse for pixel coordinates, and integers have no gradient.
+    Half precision would be too coarse for pixels, and integers would have no gradient.
 
     Raises:
         TypeCheckError: when a tensor holds booleans or complex numbers.
@@ -121,7 +121,7 @@ def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) 
 
     Args:
         name: name of the argument in error messages.
-        sigma: a number, a tensor of shape (), (*) or (*, N), or ``None`` if unknown.
+        sigma: a number or a tensor of shape (), (*) or (*, N); ``None``: unknown.
         world_points: shape (*, N, 3).
 
     Returns:

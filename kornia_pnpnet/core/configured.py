@@ -15,7 +15,7 @@ class Configured(nn.Module):
     """A module whose ``config`` holds the arguments of its constructor, except arguments that are modules.
 
     Args:
-        arguments: ``locals()`` of the subclass's constructor, called before that constructor assigns any variable.
+        arguments: the result of ``locals()`` at the start of the subclass's constructor, before any assignment.
 
     Example:
         >>> class Scale(Configured):

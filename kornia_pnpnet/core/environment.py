@@ -23,10 +23,10 @@ def environment() -> dict[str, Any]:
     """Describe the software and the machine of a measurement.
 
     Returns:
-        A dictionary with ``versions`` of the packages (``None`` for a package that is not installed), ``python``,
-        ``platform``, ``cpu``, ``threads`` (number of threads of PyTorch), ``gpu`` (``None`` without a GPU), ``commit``
-        and ``date`` (in UTC). ``commit`` is the commit of the git checkout that contains the package, with a trailing
-        ``+`` if tracked files have changes. Outside of a checkout ``commit`` is ``None``.
+        A dictionary. ``versions`` maps each package to its version, or to ``None`` if the package is not installed.
+        ``threads`` is the number of threads of PyTorch. ``gpu`` is ``None`` without a GPU. ``date`` is in UTC.
+        ``commit`` is the commit of the git checkout that contains the package, or ``None`` outside of a checkout. The
+        commit ends with ``+`` if tracked files have changes. The other keys are ``python``, ``platform`` and ``cpu``.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},

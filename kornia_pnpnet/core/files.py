@@ -19,15 +19,15 @@ from torch import Tensor
 
 __all__ = ["MOST_BYTES", "InputError", "atomic_open", "digest", "read_csv", "read_npz", "write_json"]
 
-#: Bytes. Largest total size of the arrays that :func:`read_npz` unpacks, because a few compressed megabytes can unpack
-#: to gigabytes.
+#: Bytes. :func:`read_npz` refuses files whose arrays exceed this size in total. A compressed file of a few megabytes
+#: can contain gigabytes.
 MOST_BYTES = 2**31
 
 
 class InputError(ValueError):
     """An input file or a command-line option cannot be used.
 
-    The message is a single line with the name of the file or option and, for text files, the line number.
+    The message is one line. The line begins with the file or option and, for text files, the line number.
     """
 
     def __init__(self, source: str | Path, message: str, line: int | None = None) -> None:
@@ -70,11 +70,11 @@ def write_json(path: str | Path, content: Any) -> None:
 def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] = ()) -> dict[int, dict[str, str]]:
     """Read a CSV file with a header, and map the line number of each row to its cells by column name.
 
-    Blank lines and spaces around cells are dropped. Columns beyond ``columns`` and ``optional`` are kept.
+    Blank lines and spaces around cells are dropped. Columns other than ``columns`` and ``optional`` are kept.
 
     Raises:
-        InputError: when the file is not CSV in UTF-8, when one of the ``columns`` is missing, when one of the
-            ``columns`` or ``optional`` columns occurs twice, or when a row has more or fewer cells than the header.
+        InputError: when the file is not CSV in UTF-8, a required column is missing, a required or optional column
+            occurs twice, or the number of cells differs between a row and the header.
     """
     content = Path(path).read_bytes()
     try:
@@ -124,7 +124,7 @@ def digest(*parts: Any) -> str:
     """Compute one hexadecimal SHA-256 digest of the concatenated parts.
 
     The digest of a tensor depends on dtype, shape and values, not on the device. Strings and bytes are digested
-    directly, all other data as JSON with sorted keys.
+    directly. All other data are first converted to JSON with sorted keys.
     """
     sha = hashlib.sha256()
     for part in parts:

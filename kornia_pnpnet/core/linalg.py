@@ -1,7 +1,7 @@
 """Linear algebra of small matrices, by elementwise operations. The batch is usually the last dimension.
 
-For 1000 matrices of size 3×3, an elementwise operation on one entry of all matrices takes about a microsecond. One call
-of LAPACK for each matrix takes about a millisecond in total.
+For 1000 matrices of size 3×3, an elementwise operation on one entry of all matrices takes about a microsecond. LAPACK
+needs one call per matrix, and takes about a millisecond for all 1000 matrices.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ __all__ = [
 ]
 
 # Sweeps of Jacobi's rotations in `eigenvectors`. After two sweeps, the median error of an eigenvalue of a random matrix
-# is below 1e-9 of the matrix's norm (tests/test_core_linalg.py).
+# is below 1e-9 times the norm of the matrix (tests/test_core_linalg.py).
 _SWEEPS = 2
-# Units in the last place of the diagonal entry. A smaller pivot counts as a rounding error.
+# Units in the last place of the diagonal entry. A smaller pivot is treated as a rounding error.
 _PIVOT = 10.0
-# Matrices. Up to this number LAPACK's singular value decomposition is as fast as the closed form (429 and 435 µs).
+# Matrices. For 128 matrices, LAPACK's singular value decomposition takes 429 µs and the closed form takes 435 µs.
 _MOST_BY_LAPACK = 128
 
 
@@ -95,13 +95,13 @@ def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> T
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide the values (B, N) of each problem by its largest ``size``, a constant, unless that size is 0."""
+    """Divide values (B, N) by the largest positive ``size`` of their problem. The divisor has no gradient."""
     largest = size.detach().amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
 
 def small_product(a: Tensor, b: Tensor) -> Tensor:
-    """Multiply small matrices (R, K, *) and (K, C, *), several times faster than a batched ``matmul``."""
+    """Multiply small matrices (R, K, *) and (K, C, *). A batched ``matmul`` is several times slower."""
     (column, row), *others = zip(a.unsqueeze(2).unbind(1), b.unbind(0), strict=True)  # (R, 1, *) and (C, *)
     total = column * row
     for column, row in others:
@@ -154,12 +154,12 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     radius = (mean * mean - minors / 3.0).clamp(min=eps * eps).sqrt()
     cosine = (mean * (mean * mean - 0.5 * minors) + 0.5 * determinant * determinant) / radius**3
     largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
-    # Because of the stack a compiler computes these values once per matrix, not once per entry.
+    # With this stack, a compiler computes both values once per matrix instead of once per entry.
     largest, determinant = torch.stack((largest, determinant))
-    # Let s₁ ≥ s₂ ≥ |s₃| be the singular values, where s₃ has the sign of the determinant. The matrix plus its cofactors
-    # over s₁ is `upright`. The singular vectors of both matrices are equal, and the singular values of `upright` are
-    # first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃ (twice). The Gram matrix of `upright` therefore has two distinct
-    # eigenvalues. The inverse square root of such a Gram matrix is a polynomial of degree 1 in the Gram matrix.
+    # Let s₁ ≥ s₂ ≥ |s₃| be the singular values, where s₃ has the sign of the determinant. Let `upright` be the matrix
+    # plus its cofactors divided by s₁. Its singular vectors are the singular vectors of the matrix. The singular values
+    # of `upright` are first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃ (twice). The Gram matrix of `upright` therefore
+    # has two distinct eigenvalues. The inverse square root of such a matrix is a polynomial of degree 1 in the matrix.
     upright = scaled + cofactors / largest
     first = largest + determinant / (largest * largest)
     square = first * first
@@ -180,9 +180,9 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _turned(change: Tensor, matrix: Tensor, rotation: Tensor, unique: Tensor) -> Tensor:
-    """The derivative of the nearest rotation in the direction ``change`` of the matrix."""
-    # With M = R S, a change dM of the matrix changes the rotation by dR = R hat(w), where (tr(S) I - S) w = vee(Rᵀ dM -
-    # dMᵀ R).
+    """First-order change of the nearest rotation when the matrix changes by ``change``."""
+    # Let M = R S with symmetric S. If M changes by dM, then R changes by dR = R hat(w), where w solves (tr(S) I - S) w
+    # = vee(Rᵀ dM - dMᵀ R).
     transposed = rotation.transpose(0, 1)
     inner = small_product(transposed, matrix)
     size = inner.abs().amax((0, 1))
@@ -214,12 +214,12 @@ class _NearestRotation(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        # The linear map from dM to dR is symmetric. The same map therefore takes a gradient by R to the gradient by M.
+        # The linear map from dM to dR is symmetric, so that it also maps the gradient for R to the gradient for M.
         return _turned(gradients[0], *ctx.saved_tensors)
 
 
 class _NearestRotationForward(_NearestRotation):
-    """``_NearestRotation`` with forward-mode differentiation, which ``torch.compile`` cannot trace."""
+    """``_NearestRotation`` plus forward-mode differentiation. ``torch.compile`` cannot trace this class."""
 
     generate_vmap_rule = True
 
@@ -237,16 +237,16 @@ class _NearestRotationForward(_NearestRotation):
 def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
     r"""Find the rotation :math:`R` that maximises :math:`\mathrm{tr}(R^\top M)` (orthogonal Procrustes).
 
-    Uncompiled code on a CPU decomposes up to 128 matrices by LAPACK. Otherwise a closed form is used, which takes a
-    fifth of the time of LAPACK for 1000 matrices.
+    Uncompiled code on a CPU decomposes up to 128 matrices by LAPACK. Otherwise a closed form is used. For 1000
+    matrices, the closed form takes a fifth of the time of LAPACK.
 
     Args:
         matrix: :math:`M` with the batch last, shape :math:`(3, 3, *)`.
 
     Returns:
-        The rotations, shape :math:`(3, 3, *)`, and whether each rotation is unique, bool, shape :math:`(*)`. A rotation
-        is unique when :math:`s_2 + s_3 > 0`. The singular values are :math:`s_1 \ge s_2 \ge |s_3|`, where :math:`s_3`
-        has the sign of the determinant. If the rotation is not unique, the identity without gradient is returned.
+        First, the rotations, shape :math:`(3, 3, *)`. Second, whether each rotation is unique, bool, shape :math:`(*)`.
+        Let :math:`s_1 \ge s_2 \ge |s_3|` be the singular values of :math:`M`, where :math:`s_3` has the sign of the
+        determinant. The rotation is unique if :math:`s_2 + s_3 > 0`. Otherwise the constant identity is returned.
 
     Example:
         >>> rotation, unique = nearest_rotation(torch.diag(torch.tensor([3.0, 2.0, 0.0])))
@@ -269,9 +269,9 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
         weights: weight of each point, at least 0, shape :math:`(B, K)`.
 
     Returns:
-        The rotation :math:`R`, shape :math:`(B, 3, 3)`, the translation :math:`t`, shape :math:`(B, 3)`, and the scale
-        :math:`s`, shape :math:`(B,)`. The best rigid motion is :math:`R x + t`. The best similarity has the rotation
-        :math:`R`, the scale :math:`s` and another translation.
+        First, the rotation :math:`R`, shape :math:`(B, 3, 3)`. Second, the translation :math:`t`, shape :math:`(B, 3)`.
+        Third, the scale :math:`s`, shape :math:`(B,)`. The best rigid motion maps :math:`x` to :math:`R x + t`. The
+        best similarity has the same rotation, the scale :math:`s` and another translation.
 
     Example:
         >>> points = torch.tensor([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]]])
@@ -300,8 +300,8 @@ def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
         size: the largest absolute coordinate of the points before centring, (B,). With a size of 0 or NaN the result is
             false.
     """
-    # The sum of the principal 2×2 minors of the covariance is (trace² - sum of squares) / 2. The sum divided by the
-    # trace approximates the second largest variance. For points on a line this variance is only a rounding error.
+    # The sum of the principal 2×2 minors of the covariance is (trace² - sum of squared entries) / 2. This sum divided
+    # by the trace approximates the second largest eigenvalue, which is only a rounding error for points on a line.
     eps = torch.finfo(centred.dtype).eps
     covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B), in units of the size
     trace = covariance.diagonal().sum(-1)
@@ -311,10 +311,10 @@ def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
 def solve_leading(
     matrix: Iterable[Sequence[Tensor]], rhs: Iterable[Tensor], sizes: Sequence[int]
 ) -> list[list[Tensor]]:
-    """Solve the leading blocks of symmetric systems by one LDLᵀ factorisation, entry by entry.
+    """Solve systems with leading blocks of symmetric matrices. All blocks share one LDLᵀ factorisation, entry by entry.
 
-    A small multiple of the diagonal entry is added to each pivot. The solution of a singular system is therefore finite
-    if the right side lies in the range of the matrix.
+    A small multiple of the diagonal entry of its row is added to each pivot. The solution of a singular system is
+    therefore finite if the right side lies in the range of the matrix.
 
     Args:
         matrix: rows of the positive semi-definite matrices; entries above the diagonal are not read.
@@ -344,17 +344,17 @@ def solve_leading(
 def factorise(
     rows: list[list[Tensor]], rest: list[Tensor], inverse: Callable[[int, Tensor], Tensor]
 ) -> tuple[dict[tuple[int, int], Tensor], list[Tensor]]:
-    """Factorise symmetric matrices into LDLᵀ, entry by entry, and apply the inverses of L and D to a right side.
+    """Factorise symmetric matrices as L D Lᵀ, entry by entry, and solve L D y = b.
 
     Args:
         rows: rows of the lower triangle with the diagonal; overwritten.
         rest: entries of the right side :math:`b`; overwritten.
-        inverse: maps the index of a pivot and the pivot to the inverse of the pivot. The inverse of a pivot of 0 must
-            be finite, too.
+        inverse: function of the index and the value of a pivot that returns the inverse of the pivot. The result must
+            be finite even for a pivot of 0.
 
     Returns:
-        The entries of :math:`L` below its unit diagonal, keyed by (row, column), and the entries of
-        :math:`D^{-1} L^{-1} b`.
+        First, the entries of :math:`L` below its unit diagonal, keyed by (row, column). Second, the entries of
+        :math:`y`.
     """
     count = len(rest)
     lower, inverses = {}, []
@@ -369,7 +369,7 @@ def factorise(
 
 
 def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]) -> list[Tensor]:
-    """Solve Lᵀ x = b with L of :func:`factorise` or, if b is shorter, with the leading block of L of the size of b."""
+    """Solve Lᵀ x = b, where L is from :func:`factorise`. If b is shorter than L, the leading block of L is used."""
     solution = list(scaled)
     for i in range(len(solution) - 1, 0, -1):
         for k in range(i):
@@ -380,9 +380,9 @@ def substitute(lower: Mapping[tuple[int, int], Tensor], scaled: Iterable[Tensor]
 def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     r"""Solve :math:`(H + \lambda\,\mathrm{diag}(H))\,x = g` for positive semi-definite matrices.
 
-    Uncompiled code on a CPU solves few systems by LAPACK, in a fifth of the time of LDLᵀ for one system. All other
-    systems are solved by an LDLᵀ factorisation, entry by entry. For 1000 systems LDLᵀ takes two thirds of the time of
-    LAPACK. LDLᵀ compiles to one loop.
+    Uncompiled code on a CPU solves few systems by LAPACK. For one system, LAPACK takes a fifth of the time of an
+    entrywise LDLᵀ factorisation. In all other cases LDLᵀ is used. For 1000 systems, LDLᵀ takes two thirds of the time
+    of LAPACK.
 
     Args:
         matrix: :math:`H`, shape :math:`(K, K, B)`.
@@ -390,9 +390,9 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         damping: :math:`\lambda \ge 0`, a scalar or :math:`(B,)`.
 
     Returns:
-        The solutions, shape :math:`(K, B)`, and whether each system could be solved, bool :math:`(B,)`. A system can be
-        solved when each pivot exceeds a multiple of the rounding error of its diagonal entry, a test that does not
-        depend on units. The solution of any other system is 0, with finite gradients.
+        First, the solutions, shape :math:`(K, B)`. Second, whether each system could be solved, bool :math:`(B,)`. In a
+        system that can be solved, each pivot exceeds a multiple of the rounding error of its diagonal entry. This test
+        does not depend on units. If a system could not be solved, its solution is 0, with finite gradients.
 
     Example:
         >>> matrix, right = torch.tensor([[4.0, 0.0], [0.0, 4.0]])[..., None], torch.tensor([[8.0], [4.0]])
@@ -420,8 +420,8 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
     factor, info = torch.linalg.cholesky_ex(batched.detach())
     pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
     solved = (pivots > limits.tiny).all(1) & (info == 0)  # NaN compares false
-    # For gradients (backward or forward mode), factorise again with the identity in place of systems that could not be
-    # solved: gradients of a failed factorisation are NaN.
+    # Gradients of a failed factorisation are NaN. If gradients are needed, the matrices are factorised again, with the
+    # identity in place of each matrix whose factorisation failed.
     if batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
         factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
     solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT
@@ -468,7 +468,7 @@ def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 def solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve positive definite systems (B, 3, 3). LAPACK solves few systems in half of the time of cofactors."""
+    """Solve positive definite systems (B, 3, 3). Few systems are solved by LAPACK in half of the time of cofactors."""
     if are_few(matrix):
         return torch.linalg.solve_ex(matrix, right).result
     a, b, c = matrix.unbind(1)

@@ -1,7 +1,6 @@
 """Reading and checking of JSON files. An error names the file and the first invalid entry.
 
-This module needs pydantic, which only the extras install. Modules that ``import kornia_pnpnet`` loads must therefore
-not import this module.
+This module needs pydantic, which only the extras install. ``import kornia_pnpnet`` must therefore not load this module.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def _keep(data: Any, check: ValidatorFunctionWrapHandler) -> Any:
     return data
 
 
-#: Checks the keys that a ``TypedDict`` declares, and returns the mapping unchanged, including all other keys.
+#: Checks the keys that a ``TypedDict`` declares. The mapping is returned unchanged, and all other keys are kept.
 Kept = WrapValidator(_keep)
 
 

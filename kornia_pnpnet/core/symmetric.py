@@ -1,4 +1,4 @@
-"""Symmetric 2×2 and 3×3 matrices, stored by entries: covariances of the pixel and the world point of each pair."""
+"""Symmetric 2×2 and 3×3 matrices, one tensor per entry, for the covariances of pixels and world points."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from kornia_pnpnet.core.linalg import factorise
 
 __all__ = ["Symmetric2", "Symmetric3", "are_semi_definite", "equivalent_sigma"]
 
-# Units in the last place of the trace. A matrix is not semi-definite when an eigenvalue is below minus this bound.
+# Units in the last place of the trace. An eigenvalue counts as negative only if it is below minus this bound.
 _ROUNDING = 16.0
-# Units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the rounding error of a
-# determinant hides smaller eigenvalues.
+# Units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the determinant would
+# otherwise be smaller than its rounding error.
 _LEAST = 64.0
 
 
@@ -33,7 +33,7 @@ class Symmetric2(NamedTuple):
 
     @property
     def determinant(self) -> Tensor:
-        """The determinant of a positive definite matrix, raised to a lower bound of the size of its rounding error."""
+        """The determinant of a positive definite matrix, raised to at least its rounding error."""
         product = self.uu * self.vv
         least = _LEAST * torch.finfo(product.dtype).eps * product.detach()
         return torch.addcmul(product, self.uv, self.uv, value=-1).maximum(least)
@@ -110,7 +110,7 @@ def _lower_rows(matrix: Symmetric2 | Symmetric3) -> list[list[Tensor]]:
 
 
 def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
-    """Tell whether matrices are finite and positive semi-definite up to rounding, bool, in the shape of the entries.
+    """Tell whether matrices are finite and positive semi-definite up to rounding, bool, with the shape of an entry.
 
     Example:
         >>> are_semi_definite(Symmetric2(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), torch.ones(3)))
@@ -135,7 +135,7 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
 
 
 def equivalent_sigma(matrix: Symmetric2 | Symmetric3) -> Tensor:
-    """The standard deviation of isotropic noise with the same trace; NaN if the trace is negative, infinite or NaN."""
+    """The sigma of isotropic noise whose covariance has the same trace. NaN if the trace is negative or not finite."""
     variance = torch.stack([row[-1] for row in _lower_rows(matrix)]).mean(0)
     positive = (variance > 0) & (variance < torch.inf)  # the square root has an infinite gradient at 0
     sigma = torch.where(positive, variance, 1.0).sqrt()

@@ -1,4 +1,4 @@
-"""Noise of the pairs: the precision of each pixel, and corrections of the noise by residuals."""
+"""Noise of the pairs: the precision of each pixel, and estimation of the noise from residuals."""
 
 from __future__ import annotations
 
@@ -27,53 +27,53 @@ __all__ = [
     "sq_standardised",
 ]
 
-# Logarithm of a likelihood ratio. An estimated variance factor replaces 1 if the residuals are more than e³ times as
-# likely with the estimated factor as with 1.
+# Logarithm of a likelihood ratio. An estimated variance factor is used only if the residuals are more than e³ times as
+# likely with this factor as with the factor 1.
 _BELIEVED = 3.0
-# Exponents of 4. Candidate variance factors for noise above the estimate. The weights of a too narrow kernel hide such
-# noise.
+# Exponents of 4. These powers of 4 are the candidate variance factors for noise above the estimate.
 _FACTORS = range(8)
 # Candidate exponents p: the standard deviation of the noise is proportional to confidence**p.
 _POWERS = (0.0, -1.0, -2.0, -3.0)
-# Exponents of 4. Variance factors at which the likelihoods of `_POWERS` are computed.
+# Exponents of 4. The likelihoods of `_POWERS` are computed at these powers of 4 as variance factors.
 _POWER_FACTORS = range(-5, 8)
 # Lower confidences are raised to this value, so that their pairs keep some weight.
 _LEAST_CONFIDENCE = 0.05
-# Share of inliers among the pairs. With a smaller share, `_information_factor` and `larger_sigma` change nothing.
+# Share of inliers among the pairs. With a smaller share, `_information_factor` is 1 and `larger_sigma` is 0.
 _MOST = 0.5
-# Rounds of expectation-maximisation for the share of inliers at each variance factor, and lower bound of this share.
+# Number of rounds of expectation-maximisation that estimate the share of inliers, and lower bound of this share.
 _ROUNDS, _LEAST_SHARE = 2, 0.02
 #: Factor of a variance factor below 1 in the iterations. A kernel of a third of the width separates inliers from near
 #: misses better: without it success falls by 0.5 to 0.7 points on the scene `lund_door`. Tuned on synthetic problems.
 NARROWER = 0.1
-# Lower bound of a variance factor, because residuals of exact data would give 0.
+# Lower bound of a variance factor. Exact data would give the factor 0.
 _LEAST_FACTOR = 1e-4
-# Ratio of the standard deviation of the residuals to the estimated standard deviation. The iterations by residual
-# correct smaller ratios. With larger ratios these iterations start too far from the minimum.
+# Ratio of the standard deviation of the residuals to the estimated standard deviation. Below this ratio,
+# `corrected_noise` corrects the estimate. Above this ratio, the iterations by residual start too far from the minimum,
+# and `larger_sigma` returns the noise for a second solution.
 _LARGER = 4.0
 # A pair is an inlier if its final weight is at least this fraction of its initial weight.
 _INLIER = 0.25
-# Inliers. With fewer inliers `larger_sigma` is 0, because residuals of a pose that was fitted to few inliers say little
-# about the noise. With 6 to 9 pairs, a second solution by `larger_sigma` succeeds as often as the first solution (seeds
-# 3117 and 3120 of SyntheticProblems).
+# Inliers. With fewer inliers `larger_sigma` is 0. A pose fits few inliers closely, so that their residuals say little
+# about the noise. With 6 to 9 pairs, a second solution with the noise of `larger_sigma` succeeds as often as the first
+# solution (seeds 3117 and 3120 of SyntheticProblems).
 _FEWEST = 7
-# Ratio of the residuals at the true pose to the residuals at the fitted pose.
+# Typical ratio of the residuals at the true pose to the residuals at the fitted pose.
 _FITTED = 1.1
-# `larger_sigma` makes sigmas proportional to confidence**-_POWER. For keypoints of networks an exponent of about 1 fits
-# the noise. A larger exponent is better when pairs of low confidence are outliers.
+# `larger_sigma` makes sigmas proportional to confidence**-_POWER. An exponent of about 1 fits the noise of keypoints
+# that a network detected. A larger exponent gives better poses when pairs of low confidence are outliers.
 _POWER = 1.5
-# Median length of a residual with unit variance in each coordinate.
+# Median length of a Gaussian residual with unit variance in each coordinate.
 _MEDIAN = math.sqrt(2.0 * math.log(2.0))
 
-#: Robust weight as a function of squared residual and shape, see :class:`~kornia_pnpnet.refine.kernels.RobustKernel`.
+#: Robust weight from squared residual and shape of the kernel, see :class:`~kornia_pnpnet.refine.kernels.RobustKernel`.
 KernelWeight: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 
 
 def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """Combine the noise of the caller and the initialiser to noise of every pair, ``None`` if neither gave noise.
+    """Combine the noise from the caller and the noise from the initialiser, so that the noise of every pair is known.
 
-    The sigmas are from the initialiser or, if the initialiser gave no noise, from the caller, with 0 for unknown
-    sigmas. The covariances are from the caller.
+    The result is ``None`` if neither gave noise. The sigmas are from the initialiser. If the initialiser gave no noise,
+    the sigmas are from the caller, and unknown sigmas become 0. The covariances are from the caller.
     """
     noise = starts.noise
     if noise is None and problem.noise is not None:
@@ -101,13 +101,13 @@ def pixel_precision(projection: Projection, problem: Problem, noise: Noise) -> T
 
 
 def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> Tensor:
-    """Bounded squared residuals: divided by the variance of their pixel if the noise is known, else in square pixels.
+    """Compute squared residuals with an upper bound, in variances of their pixel or, without noise, in square pixels.
 
     Args:
-        projection: the points at a state.
+        projection: the points of the problem projected at a state.
         problem: the problem, with known noise of every pair or without noise.
-        most: upper bound of a squared residual in square pixels, a scalar or (B, 1). Points behind the camera have the
-            upper bound. With covariances the bound is multiplied by the mean precision of both coordinates.
+        most: upper bound of a squared residual in square pixels, a scalar or (B, 1). Points behind the camera have this
+            residual. With covariances the bound is multiplied by the mean precision of both coordinates.
 
     Returns:
         Shape :math:`(B, N)`.
@@ -125,12 +125,12 @@ def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tenso
     """Compute squared residuals in the unit of the robust kernel, and the information of the pixels.
 
     Args:
-        projection: the points at a state.
+        projection: the points of the problem projected at a state.
         problem: the problem, with known noise of every pair or without noise.
 
     Returns:
-        Squared residuals, (B, N), and the inverse variance of each pixel, (B, N) or (B, 1), or its inverse covariance.
-        Squared residuals are in variances of their pixel or, without noise, in square pixels.
+        First, squared residuals (B, N), in variances of their pixel or, without noise, in square pixels. Second, the
+        inverse variance of each pixel, (B, N) or, without noise, (B, 1). Covariances give inverse covariances instead.
     """
     if problem.noise is None:  # without noise, sigma is one pixel of the caller
         return projection.sq_residual, problem.img_scale.square().reciprocal()[:, None]
@@ -148,30 +148,30 @@ def corrected_noise(
     outlier_area: Tensor,
     narrower: float = 1.0,
 ) -> tuple[Noise, Tensor]:
-    """Correct the noise that an initialiser estimated, by residuals.
+    """Correct the initialiser's estimate of the noise by the residuals.
 
     *Noise above the estimate.* The residuals of inliers are Gaussian with the estimated variance times a factor. The
-    pixels of outliers are uniform in an area. The candidate factors are powers of 4, and the share of inliers is
-    estimated for each factor. The most likely factor is used if its likelihood is more than :math:`e^3` times the
-    likelihood of the factor 1. Three inliers do not count in the likelihood, because a pose can fit any three pairs.
+    pixels of outliers are uniformly distributed in ``outlier_area``. The candidate factors are powers of 4. The share
+    of inliers is estimated for each factor. The most likely factor is used if its likelihood is more than :math:`e^3`
+    times the likelihood of the factor 1. The likelihood omits three inliers, because a pose can fit any three pairs.
 
-    *Noise below the estimate.* The factor is the a posteriori variance factor of an adjustment: the weighted sum of
-    squared residuals over the degrees of freedom. Only pairs deep within the kernel have large weights. The factor is
+    *Noise below the estimate.* The factor is the weighted sum of squared residuals divided by the degrees of freedom
+    (the a posteriori variance factor). Only pairs with small residuals have large weights in the sum. The factor is
     used if it is below 1 and its likelihood is more than :math:`e^3` times the likelihood of the factor 1.
 
-    With confidences, the noise is first made to depend on the confidence if the residuals show such a dependence.
+    If the residuals depend on the confidence, the noise is first adapted to the confidence.
 
     Args:
-        projection: the points at a state.
-        problem: the problem, with known noise of every pair and weights of at most about 1.
+        projection: the points of the problem projected at a state.
+        problem: the problem, with known noise of every pair. The mean of its positive weights is 1.
         kernel_weight: the robust weight, at most 1.
         shape: shape of the kernel, a scale.
-        outlier_area: see :func:`outlier_area`; 0 for problems whose noise the caller gave, (B, 1).
+        outlier_area: the result of :func:`outlier_area`, or 0 for a problem whose noise the caller gave, (B, 1).
         narrower: multiplies a variance factor below 1.
 
     Returns:
-        The corrected noise, and a factor of the kernel's shape, at most 1, (B, 1). Noise below the estimate makes the
-        kernel narrower, but does not change the sigmas.
+        First, the corrected noise. Second, a factor of at most 1 for the kernel's shape, (B, 1). If the noise is below
+        the estimate, the kernel becomes narrower, but the sigmas do not decrease.
     """
     noise, weights, area = problem.noise, problem.weights, outlier_area
     assert noise is not None
@@ -207,13 +207,13 @@ def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inli
     confidence get larger sigmas than pairs of high confidence.
 
     Args:
-        projection: the points at the final pose.
+        projection: the points of the problem projected at the final pose.
         problem: the problem.
         estimate: the noise that was estimated before the refinement.
         inlier_weights: final weight of each pair relative to its weight before the refinement, :math:`(B, N)`.
 
     Returns:
-        In pixels of the problem, shape :math:`(B, N)`.
+        Standard deviations in pixels of the problem, shape :math:`(B, N)`.
     """
     residual = projection.sq_residual.sqrt()
     expected = torch.hypot(estimate.img, (projection.focal * projection.inv_depth).mT * estimate.world)
@@ -233,9 +233,9 @@ def larger_sigma(projection: Projection, problem: Problem, estimate: Noise, inli
 
 
 def outlier_area(problem: Problem) -> Tensor:
-    """Area of the square in which pixels of outliers are uniformly distributed, in px², (B, 1).
+    """Area of the square in which pixels of outliers are assumed to be uniformly distributed, in px², (B, 1).
 
-    The distribution has the variance of the pixels of usual pairs (see :class:`~kornia_pnpnet.problem.Problem`).
+    The square has the size that gives the variance of the pixels of usual pairs (see ``Problem.usual``).
     """
     there = (problem.usual_weights > 0).to(problem.weights)[..., None]
     share = there / there.sum(1, keepdim=True).clamp(min=1.0)
@@ -257,7 +257,7 @@ def _log_likelihoods(
     outlier_area: Tensor,
     exponents: range,
 ) -> tuple[Tensor, Tensor]:
-    """Log-likelihood of the residuals at each variance factor, and the number of inliers, (F, B) each."""
+    """Log-likelihood (F, B) of the residuals at each variance factor, and the estimated number (F, B) of inliers."""
     grid = _powers_of_4(exponents, sq_residual)
     # Densities of a pixel, divided by the density of an inlier with residual 0 and variance factor 1.
     inlier = torch.exp(sq_residual * (-0.5 / grid)[:, None, None]) * in_front / grid[:, None, None]
@@ -278,9 +278,9 @@ def _information_factor(
     """Factor of each pair's precision, (B, N), if the residuals show that the noise depends on the confidence, else 1.
 
     Keypoints of a network are often less accurate at low confidence, but the confidence of a matcher says nothing about
-    the noise. The standard deviation is therefore proportional to a power of the confidence, or constant. A power is
-    used if its likelihood (see :func:`_log_likelihoods`) is more than :math:`e^3` times the likelihood of constant
-    noise, and if most pairs are inliers. Otherwise, outliers with small residuals could pass for noisy inliers.
+    the noise. The standard deviation is therefore either constant or proportional to a power of the confidence. A power
+    is used if its likelihood (see :func:`_log_likelihoods`) is more than :math:`e^3` times the likelihood of constant
+    noise, and if most pairs are inliers. With more outliers, some outliers could pass for noisy inliers.
     """
     assert problem.confidence is not None
     there = problem.weights > 0

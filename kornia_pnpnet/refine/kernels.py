@@ -1,13 +1,13 @@
 r"""Robust kernels: the weight of a pair as a function of its squared residual.
 
-A new kernel is a new entry of :data:`KERNELS`.
+To add a kernel, add an entry to :data:`KERNELS`.
 
-A kernel consists of a loss :math:`\rho(s)` of the squared residual :math:`s = \|r\|^2` and of its derivative
-:math:`w(s) = \rho'(s)`. Loss and derivative have one *shape* parameter. Iteratively reweighted least squares with the
-weight :math:`w` minimises :math:`\sum \rho`. The residual is in pixels of the normalised camera or, if the noise is
-known, in standard deviations. The shape of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the
-unit of the residual. The shape of ``power`` is the exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of
-PnP-Net (see :func:`~kornia_pnpnet.refine.residual.lm_step` for the source).
+A kernel is a loss :math:`\rho(s)` with its derivative :math:`w(s) = \rho'(s)`, where :math:`s = \|r\|^2` is the squared
+residual. Loss and derivative have one *shape* parameter. Iteratively reweighted least squares with the weight :math:`w`
+minimises :math:`\sum \rho`. The residual is in pixels of the normalised camera or, if the noise is known, in standard
+deviations. The shape of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the unit of the
+residual. The shape of ``power`` is the exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net (see
+:func:`~kornia_pnpnet.refine.residual.lm_step` for the source).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 
 __all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
 
-#: Pixels. ``power`` adds the square to squared residuals, because its weight at 0 would be infinite otherwise.
+#: Pixels. ``power`` adds the square of this number to squared residuals, so that the weight at 0 is finite.
 POWER_FLOOR = 0.1
 
 
@@ -29,7 +29,7 @@ class RobustKernel(NamedTuple):
 
     Attributes:
         loss: ``loss(sq_residual, shape)``, non-decreasing, and 0 for a residual of 0.
-        weight: ``weight(sq_residual, shape)``, the derivative of ``loss`` by ``sq_residual``.
+        weight: ``weight(sq_residual, shape)``, the derivative of ``loss`` with respect to ``sq_residual``.
         default: the classical value of the shape.
         lower: the smallest shape that may be learned.
         upper: the largest shape that may be learned.
@@ -54,9 +54,9 @@ def _power_weight(sq_residual: Tensor, alpha: Tensor) -> Tensor:
 
 
 def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:
-    # The loss is the integral of (s + c)^(-alpha/2) from 0, where c is `floor`. With e = 1 - alpha/2 and L = log(1 +
-    # s/c), the integral is c^e L (exp(e L) - 1) / (e L). A series replaces the last factor close to e L = 0, so that
-    # the loss is smooth at alpha = 2.
+    # The loss is the integral of the weight (s + c)^(-alpha/2) from 0 to s, where c is `floor`. With e = 1 - alpha/2
+    # and L = log(1 + s/c), the integral is c^e L (exp(e L) - 1) / (e L). Close to e L = 0, a series replaces the last
+    # factor, so that the loss is smooth at alpha = 2.
     floor = POWER_FLOOR**2
     exponent = 1.0 - 0.5 * alpha
     log_ratio = torch.log1p(sq_residual / floor)
@@ -97,7 +97,7 @@ def _geman_mcclure_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
 
 
 def _truncated_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    # The zero term keeps the scale in the autograd graph: distributed training expects a gradient of every parameter.
+    # Distributed training expects a gradient of every parameter. The zero term therefore keeps the scale in the graph.
     return (sq_residual < scale * scale).to(sq_residual.dtype) + 0.0 * scale
 
 

@@ -36,10 +36,10 @@ __all__ = ["BACKWARDS", "Plan", "Refinement", "RobustWeightedLM"]
 #: How gradients pass through a refinement, see :class:`RobustWeightedLM`.
 BACKWARDS = ("unroll", "implicit")
 
-# Focal lengths. Upper bound of a residual in the cost. The residual of a point behind the camera counts as this bound,
-# so that the point never costs less than a point in front of the camera.
+# Focal lengths. Upper bound of a residual in the cost. Points behind the camera have this residual, so that no point in
+# front of the camera costs more than a point behind the camera.
 _MAX_RESIDUAL = 2.0
-# Units in the last place, of costs and of residuals. With `reject_worse`, smaller increases of the cost are ignored.
+# Units in the last place. With `reject_worse`, a step is rejected only if the cost rises by more than this.
 _ROUNDING = 100.0
 # Factors of the damping after a rejected and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
@@ -49,20 +49,20 @@ class Plan(NamedTuple):
     r"""The inputs of all iterations of a refinement, prepared before the first iteration.
 
     Attributes:
-        problem: the problem in the memory layout of ``kornia_pnpnet.core.performance.problems_last``, with the
-            weights of the caller, and with known noise of every pair or without noise.
+        problem: the problem in the memory layout of ``kornia_pnpnet.core.performance.problems_last``. The weights are
+            from the caller. The noise is known for every pair or ``None``.
         prior: weight of each pair without the robust weight, for the cost and :meth:`RobustWeightedLM.judge`,
-            :math:`(B, N)`. With iterations by residual, ``prior`` is the weight of the caller. Otherwise ``prior`` is
-            the product of the weights of caller and initialiser.
-        guided: product of the weights of caller and initialiser, divided by the largest product, :math:`(B, N)`.
+            :math:`(B, N)`. With iterations by residual, ``prior`` is the caller's weight. Otherwise ``prior`` is the
+            product of the caller's and the initialiser's weight.
+        guided: product of the caller's and the initialiser's weight, divided by the largest product, :math:`(B, N)`.
         by_residual: weights in the iterations by residual: the weights of the caller, divided by their mean,
             :math:`(B, N)`. Without iterations by residual, ``by_residual`` equals ``guided``.
-        state: the initial states, a batch of :math:`S B`: the first state of every problem, then the second state of
-            every problem, and so on.
+        state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second state
+            of every problem, and so on.
         area: :func:`~kornia_pnpnet.refine.information.outlier_area` of problems whose noise is corrected by residuals,
             0 for all other problems, :math:`(B, 1)`; ``None``: no noise is corrected.
-        noiseless: problems without noise in a batch with noise from the caller, bool :math:`(B,)`; ``None``: the caller
-            gave no noise, or the initialiser returned noise.
+        noiseless: whether the caller gave no noise for a problem, bool :math:`(B,)`; ``None``: the caller gave no noise
+            for the whole batch, or the initialiser returned noise.
         hyperparameters: step :math:`\gamma`, damping :math:`\lambda` and the kernel's shape of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
     """
@@ -118,21 +118,21 @@ class RobustWeightedLM(Configured):
     Each iteration takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. The weight of a pair is the product of the
     caller's weight, the initialiser's weight, and the robust weight of the pair's residual at the previous estimate.
     Step :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``)
-    are learned, by default one set per iteration. The initial hyperparameters give the classical method.
+    are learned. By default each iteration has its own values. The initial hyperparameters give the classical method.
 
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
     pixel (:func:`~kornia_pnpnet.refine.residual.pixel_variance` at the previous estimate). If the caller gave
-    covariances, residuals are whitened by the covariance of their pixel. The scale of a kernel is then in standard
-    deviations, and the cost is in squared standard deviations.
+    covariances, residuals are whitened by the covariance of their pixel. With noise, the scale of a kernel is in
+    standard deviations, and the cost is in squared standard deviations.
 
     *Several poses.* If an initialiser returns several poses, the first 70 % of the iterations (rounded down) refine all
-    poses. The remaining iterations refine only the pose of the lowest cost. This cost is computed with the kernel of
-    the last iteration on all poses.
+    poses. The remaining iterations refine only the pose of the lowest cost. For this choice, the cost uses the kernel
+    of the last iteration that refined all poses.
 
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
-    weights, because residuals then separate inliers from outliers better than the initialiser's weights. If the
-    initialiser estimated the noise, :func:`~kornia_pnpnet.refine.information.corrected_noise` corrects the estimate
-    before these iterations. Noise that the caller gave is not corrected.
+    weights, because by then the residuals separate inliers from outliers better. If the initialiser estimated the
+    noise, :func:`~kornia_pnpnet.refine.information.corrected_noise` corrects the estimate before these iterations.
+    Noise that the caller gave is not corrected.
 
     Problems are independent. A problem that cannot be solved keeps its pose, reports ``ok=False``, and does not change
     other problems.
@@ -147,15 +147,15 @@ class RobustWeightedLM(Configured):
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
         reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. Without
-            rejection, iterations from a distant start can diverge. From a good start, both variants take nearly the
-            same steps, and iterations without rejection are faster.
-        by_residual: number of final iterations that ignore the initialiser's weights, at most the iterations after the
-            choice among several poses. Needs a kernel whose weights are at most 1, which excludes ``power``.
+            rejection, iterations from a distant start can diverge. From a good start, rejection takes time but hardly
+            changes the steps.
+        by_residual: number of final iterations that ignore the initialiser's weights. This number is limited to the
+            iterations after the choice among several poses. The weights of the kernel must be at most 1, which excludes
+            ``power``.
         learnable: whether the hyperparameters are trained.
         backward: how gradients are computed. ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the
-            implicit function theorem to the last state, with memory that does not grow with ``m``. The implicit
-            gradient is exact if the iterations have converged. Step, damping and initial poses have no implicit
-            gradient.
+            implicit function theorem to the last state. The memory then does not grow with ``m``. The implicit gradient
+            is exact if the iterations have converged. Step, damping and initial poses have no implicit gradient.
 
     Raises:
         BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
@@ -250,15 +250,15 @@ class RobustWeightedLM(Configured):
 
         Args:
             problem: :math:`B` problems with :math:`N` pairs each.
-            starts: initial poses in the frame of the problem, and a factor of the weight of each pair.
+            starts: initial poses in the frame of the problem, and a weight factor for each pair.
             m: number of iterations to run; ``None``: all iterations.
             more: number of additional iterations with the hyperparameters of the last iteration.
             run: calls each part of the refinement, compiled or uncompiled.
 
         Returns:
-            The refined poses, the weights and the cost at these poses with the kernel of the last iteration, and
-            ``ok``. A pose is ``ok`` only if the equations of the last iteration could be solved and three pairs are in
-            front of the camera. With unknown noise, the pose must explain the pixels better than a single point
+            The refined poses. Weights and cost are computed at these poses with the kernel of the last iteration. A
+            pose is ``ok`` only if the equations of the last iteration could be solved and three pairs are in front of
+            the camera. With unknown noise, the pose must explain the pixels better than a single point
             (:func:`~kornia_pnpnet.judge.belief.explains`). With known noise, the pose must have more inliers than
             expected by chance (:func:`~kornia_pnpnet.judge.belief.believe`). The pairs must determine an unknown focal
             length (:func:`~kornia_pnpnet.judge.belief.has_focal`).
@@ -278,13 +278,13 @@ class RobustWeightedLM(Configured):
         if self.by_residual and unknown is not None and problem.noise is not None and not problem.noise.covariances:
             all_known = sees_values(unknown) and unknown.device.type == "cpu" and not bool(unknown.any())
             area = None if all_known else torch.where(unknown, outlier_area(problem), 0.0)
-        # A common factor of the weights does not change a step. The division keeps products of tiny weights from
-        # vanishing.
+        # A common factor of the weights does not change a step. The division prevents underflow of products of tiny
+        # weights.
         guided = by_residual = relative(prior, prior)
         if self.by_residual:
             by_residual, prior = _relative_to_mean(problem.weights), problem.weights
         poses = starts.poses
-        # In the memory layout of `problems_last`: (3, 3, S B) and (3, S B).
+        # The memory layout of `problems_last` is (3, 3, S B) and (3, S B).
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
@@ -356,7 +356,7 @@ class RobustWeightedLM(Configured):
     def _correct(
         self, problem: Problem, state: State, shape: Tensor, area: Tensor, narrower: float
     ) -> tuple[Noise, Tensor]:
-        """Correct the noise by the residuals at a state, see :func:`corrected_noise` for the result."""
+        """Correct the noise by the residuals at a state. See :func:`corrected_noise` for the result."""
         shape = per_problem(shape, problem.weights[:, :1])
         return corrected_noise(project(state, problem), problem, self.kernel.weight, shape, area, narrower)
 
@@ -372,8 +372,8 @@ class RobustWeightedLM(Configured):
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
-        # At a minimum, rounding errors decide which cost is lower. Such steps are accepted, because a rejected step has
-        # no gradient.
+        # At a minimum, both costs differ only by rounding errors. The step is then accepted, because a rejected step
+        # has no gradient.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
@@ -381,7 +381,7 @@ class RobustWeightedLM(Configured):
         return Progress(kept, solved, factor)
 
     def _equations(self, projection: Projection, problem: Problem, shape: Tensor) -> NormalEquations:
-        """The sum of the normal equations of the pairs, weighted and whitened, and of the terms."""
+        """Sum the normal equations of the terms and of the weighted and whitened pairs."""
         sq_residual, precision = information(projection, problem)
         robust = problem.weights * self.kernel.weight(sq_residual, shape)
         weights = map_tensors(lambda x: x * robust, precision)
@@ -391,11 +391,11 @@ class RobustWeightedLM(Configured):
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
-        """Keep the state of the lowest cost of each problem, out of all states of the problem in ``now``."""
+        """Of the states of each problem in ``now``, keep the state with the lowest cost."""
         batch = prior.shape[0]
         projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
-        best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,), the first state of equal costs
+        best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,); at equal costs the first state
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
         return map_tensors(lambda x: x.movedim(0, -1).index_select(-1, index).movedim(-1, 0), now)
 
@@ -413,10 +413,11 @@ class RobustWeightedLM(Configured):
         r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
 
         Let :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`. At the minimum :math:`g = 0`, so that
-        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`. The code takes a Newton step with this gradient and
-        the value 0. If the Newton matrix is not positive definite, the state is not a minimum yet, and the Gauss-Newton
-        matrix is used. A second step with the same matrix makes second derivatives exact. With covariances, which
-        rotate with the pose, the matrix is not exactly symmetric. A third step then removes most of the error.
+        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`. The code adds a Newton step that has this gradient
+        and the value 0. If the Newton matrix is not positive definite, the state is not a minimum yet. The Gauss-Newton
+        matrix is then used. A second step with the same matrix makes second derivatives exact. Covariances rotate with
+        the pose, so that the matrix is not exactly symmetric. With covariances, a third step therefore removes most of
+        the error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
@@ -439,6 +440,6 @@ class RobustWeightedLM(Configured):
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:
-    """Divide weights by the mean positive weight. The largest weight has no derivative if two weights are equal."""
+    """Divide weights by the mean of the positive weights. Unlike the largest weight, the mean is differentiable."""
     mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
     return weights / torch.where(mean > 0, mean, 1.0)

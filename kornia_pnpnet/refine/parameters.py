@@ -12,7 +12,7 @@ from kornia_pnpnet.core.checks import check_numbers, check_whole
 
 __all__ = ["BoundedParameter"]
 
-# Raw parameter of a value at its bound. The sigmoid of 1000 rounds to 1 in float64.
+# Largest absolute value of a raw parameter. The sigmoid of 1000 rounds to 1 in float64.
 _BOUND = 1e3
 
 
@@ -46,8 +46,7 @@ class BoundedParameter(nn.Module):
         self._logarithmic = logarithmic
         self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)
         share = ((math.log(initial) if logarithmic else initial) - self._lower) / (self._upper - self._lower)
-        # Clamping keeps the raw parameter finite at a bound, so that it can be saved. The sigmoid is still exactly 0 or
-        # 1.
+        # The logit of a bound is infinite and could not be saved. The sigmoid of the clamped logit is still 0 or 1.
         self.raw = nn.Parameter(torch.full((size,), share).logit().clamp(-_BOUND, _BOUND))
 
     def forward(self) -> Tensor:

@@ -1,13 +1,13 @@
 """The reprojection residual: projection, Jacobian, normal equations, and the motion of a state along a tangent vector.
 
-Convention: ``x_cam = R x_world + t``; the camera looks along +z; pixels belong to a camera with a single focal length
-and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its distance. The test
-does not depend on the unit of the world.
+The pose maps points by ``x_cam = R x_world + t``. The camera looks along +z. Pixels belong to a camera with a single
+focal length and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its
+distance. The test does not depend on the unit of the world.
 
 The dimensions of arrays in this module are coordinates, pairs and problems, in this order. An operation then runs over
-long rows of memory even if each problem has few pairs. Kornia's ``transform_points`` and ``project_points`` compute the
-same projection (``tests/test_kornia_contract.py``), but neither residual nor Jacobian. For 1000 problems of 9 pairs,
-these batch-first functions take three times as long as this module.
+long rows of memory, even if each problem has few pairs. Kornia's ``transform_points`` and ``project_points`` compute
+the same projection (``tests/test_kornia_contract.py``), but neither residual nor Jacobian. For 1000 problems of 9
+pairs, these batch-first functions take three times as long as this module.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ __all__ = [
     "rotation_angle",
 ]
 
-#: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. In front, ``|x / z|`` is below 1000.
+#: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. Otherwise ``|x / z|`` is below 1000.
 MIN_DEPTH_RATIO = 1e-3
-# Largest changes in one step, of the logarithm of the focal length (its exponential must not overflow) and of a
-# coefficient of radial distortion.
+# Largest changes in one step: of the logarithm of the focal length, and of a coefficient of radial distortion. The
+# exponential of a larger change could overflow.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
 
 # The entries of u and v in one column of the Jacobian. An entry that is the same for all pairs is a Python number.
@@ -59,7 +59,7 @@ class Projection(NamedTuple):
         residual: projection minus measurement in pixels, shape :math:`(2, N, B)`. If ``front`` is false, the residual
             is finite but meaningless.
         front: whether the point is in front of the camera, bool, shape :math:`(N, B)`.
-        rotated: the points in the axes of the pose before translation, :math:`y = R x`, shape :math:`(3, N, B)`.
+        rotated: the rotated points before translation, :math:`y = R x`, shape :math:`(3, N, B)`.
         plane: :math:`(p, q) = (x/z, y/z)`, 0 for points behind the camera, shape :math:`(2, N, B)`.
         inv_depth: :math:`1/z`, 0 for points behind the camera, shape :math:`(N, B)`.
         scaled: the residual times the depth, shape :math:`(2, N, B)`.
@@ -67,8 +67,8 @@ class Projection(NamedTuple):
         state: the state.
         stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
             ``None``: there is no distortion.
-        slope: twice the derivative of :math:`d` by :math:`\rho^2`, shape :math:`(N, B)`; ``None``: there is no
-            distortion.
+        slope: twice the derivative of :math:`d` with respect to :math:`\rho^2`, shape :math:`(N, B)`; ``None``: there
+            is no distortion.
     """
 
     residual: Tensor
@@ -118,7 +118,7 @@ def project(state: State, problem: Problem) -> Projection:
         problem: the problem.
 
     Returns:
-        The :class:`Projection`. The residual is :math:`f d (p, q) - b` with the pixel :math:`b`.
+        The :class:`Projection`. The residual is :math:`f d (p, q) - b`, where :math:`b` is the pixel.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[1.0, 2.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -169,7 +169,7 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
         noise: standard deviations.
 
     Returns:
-        The mean variance, shape :math:`(B, N)`. Behind the camera only the noise of the pixel counts.
+        The mean variance, shape :math:`(B, N)`. A point behind the camera has only the noise of its pixel.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[0.0, 0.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -184,7 +184,7 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
 
 
 def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
-    """:func:`covariance_at` of a projection, entries (B, N). Behind the camera only the noise of the pixel counts."""
+    """Covariance of each pixel, entries (B, N). A point behind the camera has only the noise of its pixel."""
     rotation = projection.state.pose.rotation[:, None]
     rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
     p, q = (x.mT for x in projection.plane.unbind())
@@ -194,8 +194,8 @@ def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> 
 def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: Noise) -> Symmetric2:
     r"""Covariance of a pixel, from the noise of the pixel and of the world point.
 
-    The covariance is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top` with :math:`J` of
-    :func:`pixel_variance`. If only a standard deviation :math:`\sigma` is known, :math:`\Sigma = \sigma^2 I`.
+    The covariance is :math:`\Sigma_\mathrm{img} + J R\,\Sigma_\mathrm{world} R^\top J^\top`. See :func:`pixel_variance`
+    for :math:`J`. A standard deviation :math:`\sigma` gives :math:`\Sigma = \sigma^2 I`.
 
     Args:
         rotation: rotation from the world to the camera, :math:`(*, 1, 3, 3)` or :math:`(*, N, 3, 3)`.
@@ -229,11 +229,11 @@ def normal_equations(
         weights: weight of each pair, :math:`(B, N)`, or 2x2 weight matrix of each pair with entries :math:`(B, N)`.
             Points behind the camera do not count.
         relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
-            vanish. The divisor has no gradient.
+            underflow. The divisor has no gradient.
 
     Returns:
-        The equations of a tangent vector of :func:`moved`, with :math:`J` divided by the focal length and :math:`r` in
-        pixels.
+        The normal equations for a tangent vector of :func:`moved`. :math:`J` is divided by the focal length, and
+        :math:`r` is in pixels.
     """
     unit, sq_inverse = None, projection.inv_depth * projection.inv_depth
     if relative:
@@ -246,11 +246,11 @@ def normal_equations(
 
 
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
-    r"""The rows of u and v of :math:`z J / f`, shape :math:`(6 + K, 2, N, B)`.
+    r"""The rows of the Jacobian for u and v, times :math:`z / f`, shape :math:`(6 + K, 2, N, B)`.
 
-    Let :math:`y = R x`, and let :math:`e` be a row of :math:`z` times the derivative of :math:`(p, q)` by a point in
-    the frame of the pose. The entries of a row of the Jacobian are :math:`y \times e` for the rotation and :math:`e`
-    for the translation. For one camera the rows :math:`e` are :math:`(1, 0, -p)` and :math:`(0, 1, -q)`.
+    Let :math:`y = R x`. Let :math:`e` be a row of :math:`z` times the derivative of :math:`(p, q)` with respect to a
+    point in the frame of the pose. The entries of a row of the Jacobian are :math:`y \times e` for the rotation and
+    :math:`e` for the translation. For one camera the rows :math:`e` are :math:`(1, 0, -p)` and :math:`(0, 1, -q)`.
     """
     plane, y3 = projection.plane, projection.rotated[2]
     if problem.rig is None:
@@ -266,7 +266,7 @@ def _jacobian(projection: Projection, problem: Problem) -> Tensor:
     if projection.stretch is None or projection.slope is None:
         zoomed, powers = y3, []  # the depth of the origin grows with f, see `moved`
     else:
-        # The derivative of the distorted by the undistorted point is d I + 2 d' (p, q) (p, q)^T, with 2 d' in `slope`.
+        # The Jacobian of the distortion is d I + slope (p, q) (p, q)^T.
         along = projection.slope * (plane * jacobian).sum(1, keepdim=True)
         jacobian = projection.stretch * jacobian + along * plane
         depth = torch.where(projection.front, projection.inv_depth, 1.0).reciprocal()
@@ -277,7 +277,7 @@ def _jacobian(projection: Projection, problem: Problem) -> Tensor:
 
 
 def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
-    """Build the normal equations by one product of all columns. Few calls suffice, which is faster for few pairs."""
+    """Build the normal equations by one product of all columns. The low number of calls is faster for few pairs."""
     jacobian = _jacobian(projection, problem)
     if isinstance(weights, Tensor):
         weighted = jacobian * weights
@@ -292,7 +292,7 @@ def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor
 def _entrywise_equations(
     projection: Projection, problem: Problem, weights: Tensor | Symmetric2
 ) -> tuple[Tensor, Tensor]:
-    """Build the normal equations entry by entry. Temporaries (N, B) fit into the cache or, compiled, into registers."""
+    """Build the normal equations entry by entry. The temporary tensors have the shape (N, B) and fit into the cache."""
     columns = _columns(projection, problem)
     uu, uv, vv = (weights, 0.0, weights) if isinstance(weights, Tensor) else weights
     total = uu.sum(0)
@@ -300,7 +300,7 @@ def _entrywise_equations(
     weighted = [(_plus(_times(u, uu), _times(v, uv)), _plus(_times(u, uv), _times(v, vv))) for u, v in columns]
 
     def inner(a: _Column, b: _Column) -> Tensor:
-        """Sum over pairs and rows of the products of two columns, (B,)."""
+        """Inner product (B,) of two columns, over pairs and over u and v."""
         (a_u, a_v), (b_u, b_v) = a, b
         if type(a_u) is type(a_v) is type(b_u) is type(b_v):
             return torch.addcmul(a_u * b_u, a_v, b_v).sum(0)
@@ -309,7 +309,7 @@ def _entrywise_equations(
             return zero
         return total if products[0] is uu else products[0].sum(0)
 
-    # Columns 3 and 4 are constant, (1, 0) and (0, 1). Their products with a weighted column are entries of that column.
+    # Columns 3 and 4 are (1, 0) and (0, 1). Their products with a weighted column are its u and v entries.
     size = range(len(columns))
     lower = {
         (i, j): inner(weighted[j], columns[i]) if i < 5 else inner(weighted[i], columns[j])
@@ -322,7 +322,7 @@ def _entrywise_equations(
 
 
 def _columns(projection: Projection, problem: Problem) -> list[_Column]:
-    """The columns of :func:`_jacobian`. Without rig and distortion two are constant, which saves a quarter of time."""
+    """The columns of :func:`_jacobian`. Without rig and distortion, two columns are constant, which saves time."""
     if problem.rig is not None or projection.stretch is not None:
         return [(u, v) for u, v in _jacobian(projection, problem)]
     y1, y2, y3 = projection.rotated.unbind()
@@ -366,8 +366,8 @@ def lm_step(
     The residual :math:`r` of the state :math:`\beta` is projection minus measurement, hence the minus sign. A common
     factor of the weights does not change the step.
 
-    Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, section 3. The damping by
-    the diagonal is D. Marquardt's (1963).
+    Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, section 3. D. Marquardt
+    (1963) proposed the damping by the diagonal.
 
     Args:
         equations: the normal equations at the state.
@@ -384,8 +384,8 @@ def lm_step(
     if not additive:
         delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
         return moved(state, delta * (-step / focal)), solved
-    # Write the equations in terms of the rotation vector. The derivative of the tangent vector by the rotation vector
-    # is the left Jacobian of SO(3).
+    # Write the equations in terms of the rotation vector. The derivative of the tangent vector with respect to the
+    # rotation vector is the left Jacobian of SO(3).
     rvec = rotation_matrix_to_axis_angle(state.pose.rotation)
     size, matrix = len(equations.gradient), equations.matrix.permute(2, 0, 1)
     tangent = torch.eye(size, dtype=rvec.dtype, device=rvec.device).repeat(len(rvec), 1, 1)
@@ -406,12 +406,12 @@ def moved(state: State, delta: Tensor) -> State:
 
     The Cayley transform is
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`. The transform agrees
-    with the exponential to second order. The angle of rotation is :math:`2 \arctan(|\omega|/2)`, at most half a turn.
-    The transform needs neither trigonometry nor a branch at 0.
+    with the exponential map to second order. The angle of rotation is :math:`2 \arctan(|\omega|/2)`, at most half a
+    turn. The transform needs neither trigonometry nor a branch at 0.
 
     The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
     zoom. The origin, which is the centroid of a centred world, then keeps its pixel and its scale. Without this motion,
-    a change of the focal length and a shift along the optical axis would be nearly the same for distant points.
+    a change of the focal length would move the pixels of distant points almost like a shift along the optical axis.
     """
     half, rotation = 0.5 * delta[:3], state.pose.rotation.permute(1, 2, 0)
     factor = 2.0 / (1.0 + half.square().sum(0))

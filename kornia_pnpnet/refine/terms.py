@@ -1,6 +1,6 @@
 """Priors of the pose and of the camera. Each prior is a :class:`~kornia_pnpnet.problem.Term`.
 
-A new prior is a class with the methods of :class:`~kornia_pnpnet.problem.Term`, and an entry of ``Problem.terms``.
+To add a prior, write a class with the methods of ``Term``, and add an instance to ``Problem.terms``.
 """
 
 from __future__ import annotations
@@ -21,23 +21,21 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# Smallest eigenvalue of an information matrix in a known direction, relative to the largest eigenvalue or to a unit
-# diagonal. Smaller eigenvalues count as 0.
+# Share of the largest eigenvalue of an information matrix, or of its unit diagonal. Smaller eigenvalues count as 0.
 _KNOWN = 1e-5
-# Standard deviations. Scale of the robust kernel if the caller gave no scale.
+# Standard deviations. Default scale of the robust kernel.
 _SCALE = 3.0
-# Lower bound of 1 plus the trace of the rotation to the prior, by which the tangent vector is divided.
+# Lower bound of 1 + tr(R), the denominator of the tangent vector of the rotation R from a pose to the prior.
 _LEAST_DENOMINATOR = 1e-4
 # Prior standard deviation of a coefficient of radial distortion. The prior keeps a coefficient close to 0 if the pairs
 # do not determine the coefficient.
 _RADIAL = 0.15
-# Largest number of matrices whose eigenvalues are computed in one call of cuSOLVER. A call with a hundred thousand
-# matrices fails.
+# Matrices. Largest batch of one call of cuSOLVER. A call with a hundred thousand matrices fails.
 _MOST_MATRICES = 10_000
 
 
 def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
-    """Make a prior from a measured direction of gravity, for example of an accelerometer.
+    """Make a prior from a measured direction of gravity, for example from an accelerometer.
 
     The prior says nothing about heading and position.
 
@@ -45,8 +43,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
         world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`.
         cam_down: measured direction of gravity in the camera's axes (+z forward), of any non-zero length, shape
             :math:`(B, 3)`.
-        sigma: standard deviation of the measured direction about each axis perpendicular to this direction, in radians,
-            a number or :math:`(B,)`.
+        sigma: standard deviation of the measured direction in radians, a number or :math:`(B,)`. The errors about both
+            axes perpendicular to the direction have this standard deviation.
 
     Returns:
         The prior. The rotation of its pose turns ``world_down`` to ``cam_down``. The heading of this rotation is
@@ -67,8 +65,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     KORNIA_CHECK(isinstance(sigma, Tensor) or sigma > 0, f"sigma must be positive, got {sigma}.")
     a, b = (functional.normalize(x, dim=-1) for x in (world_down, cam_down))
     eye = torch.eye(3, dtype=b.dtype, device=b.device)
-    # Half a turn about the bisector of both directions. Opposite directions have no bisector; any perpendicular axis is
-    # used instead.
+    # The rotation is half a turn about the bisector of both directions. Opposite directions have no bisector. Any
+    # perpendicular axis is used instead.
     across = torch.linalg.cross(a, eye[a.detach().abs().argmin(-1)])
     opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
     middle = functional.normalize(torch.where(opposite, across, a + b), dim=-1)
@@ -84,7 +82,7 @@ def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> Norma
 
     Args:
         equations: the normal equations of the pairs at a state, with weights in inverse square pixels.
-        linear: the term at the same state.
+        linear: the term, linearised at the same state.
         focal: the focal length in pixels, a scalar or (B,).
     """
     weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
@@ -116,7 +114,7 @@ class CameraTerm(NamedTuple):
         return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
 
     def linearise(self, state: State) -> Linear:
-        """Linearise the difference of log f from its expected value, and the coefficients of distortion."""
+        """Linearise the term. The residual is log f minus its expected value, then the coefficients of distortion."""
         assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
@@ -141,9 +139,9 @@ class PoseTerm(NamedTuple):
     Attributes:
         pose: the expected pose.
         information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
-        offset: the centroid of the caller's world in lengths of the problem, shape :math:`(B, 3)`. Shifts of the prior
-            refer to the origin of the caller's world.
-        free: the only axis in the camera about which the rotation is unknown, 0 if there is no such axis, shape
+        offset: the point of the caller's world that is the origin of the problem, in lengths of the problem, shape
+            :math:`(B, 3)`. Errors of the translation are measured at the origin of the caller's world.
+        free: axis in the camera about which the rotation is unknown, 0 unless exactly one such axis exists, shape
             :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
         rank: number of directions in which the prior has information, shape :math:`(B,)`.
@@ -166,7 +164,7 @@ class PoseTerm(NamedTuple):
             scale: lengths of the problem per unit of the caller's world, (B,).
 
         Returns:
-            The term, and whether the prior is usable (see ``_is_usable``), bool (B,). The information of an
+            First, the term. Second, whether the prior is usable (see ``_is_usable``), bool (B,). The information of an
             unusable prior becomes 0.
         """
         usable = _is_usable(prior)
@@ -198,11 +196,12 @@ class PoseTerm(NamedTuple):
             pose: poses, :math:`(B, 3, 3)` and :math:`(B, 3)`.
 
         Returns:
-            The tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract` without rotation
-            about ``free``, :math:`(B, 6)`, and its squared Mahalanobis length, :math:`(B,)`.
+            First, the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`. The
+            vector has the shape :math:`(B, 6)` and contains no rotation about ``free``. Second, the squared
+            Mahalanobis length of the vector, :math:`(B,)`.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Rotate the prior's pose about the free axis, as close as possible to the given pose.
+        # Rotate the prior's pose about the free axis until it is as close as possible to the given pose.
         free = self.free
         along = turn.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (turn @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(turn - turn.mT)).sum(-1)
@@ -220,13 +219,13 @@ class PoseTerm(NamedTuple):
         return error, ((self.information * error[..., None, :]).sum(-1) * error).sum(-1)
 
     def linearise(self, state: State) -> Linear:
-        """See :class:`~kornia_pnpnet.problem.Term`. The residual is the tangent vector to the expected pose."""
+        """See :class:`~kornia_pnpnet.problem.Term`. The residual is the tangent vector of :meth:`errors`."""
         error, square = self.errors(state.pose)
         half = 0.5 * error[:, :3]
         eye = torch.eye(3, dtype=error.dtype, device=error.device)
         turned = (state.pose.rotation * self.offset[:, None]).sum(-1)
         rows = eye + So3.hat(half) + half[:, :, None] * half[:, None]
-        # If the state moves, the closest pose that the prior allows rotates about the free axis, too.
+        # If the state rotates, the closest pose of the prior also rotates about the free axis.
         follows = self.free - torch.linalg.cross(half, self.free)
         rows = rows - follows[:, :, None] * (self.free[:, None] @ rows)
         by_turn = torch.cat((-rows, -So3.hat(turned)), 1)
@@ -244,13 +243,13 @@ class PoseTerm(NamedTuple):
         return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-square / scale))
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """See :class:`~kornia_pnpnet.problem.Term`. A prior of two known directions counts at most as one outlier."""
+        """See :class:`~kornia_pnpnet.problem.Term`. The penalty is at most half of ``rank``."""
         scale = torch.where(self.sq_scale.isinf(), _SCALE**2 * self.rank.clamp(min=1.0), self.sq_scale)
         return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
 
 
 def _is_usable(prior: PosePrior) -> Tensor:
-    """Whether numbers are bounded, the scale positive, and the information symmetric positive semi-definite, (B,)."""
+    """Whether numbers are bounded, the scale is positive, and the information is positive semi-definite, bool (B,)."""
     numbers = [prior.pose.rotation, prior.pose.translation, prior.information]
     limit = torch.finfo(prior.information.dtype).max ** 0.25
     fine = torch.stack([(x.detach().flatten(1).abs() < limit).all(1) for x in numbers]).all(0)
@@ -261,7 +260,7 @@ def _is_usable(prior: PosePrior) -> Tensor:
 
 
 def _open_axis(information: Tensor) -> Tensor:
-    """The axis (B, 3) about which rotation is unknown while rotation about the other axes is known, or 0."""
+    """The only axis (B, 3) about which the rotation is unknown, 0 unless exactly one such axis exists."""
     eigenvalues = _eigenvalues(information.detach().double())
     least, middle, largest = eigenvalues.unbind(-1)
     is_open = (least < _KNOWN * largest) & (middle > _KNOWN * largest)
@@ -276,7 +275,7 @@ def _open_axis(information: Tensor) -> Tensor:
 
 
 def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
-    """Ascending eigenvalues (B, 6) of matrices scaled to a unit diagonal; whether each matrix is symmetric, (B,)."""
+    """Ascending eigenvalues (B, 6) after scaling to a unit diagonal, and whether each matrix is symmetric, (B,)."""
     diagonal = information.detach().double().diagonal(dim1=1, dim2=2)
     size = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     scaled = information.detach().double() * size[:, :, None] * size[:, None]
