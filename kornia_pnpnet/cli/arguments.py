@@ -1,4 +1,4 @@
-"""The arguments of all commands as one table, the parser of these arguments, and the solver named by an argument."""
+"""The arguments of all commands in one table, their parser, and the solver for ``--solver``."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: st
 
 
 def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
-    """Make a parser of integers. The default of ``high`` keeps huge numbers of problems from filling the memory."""
+    """Make a parser of integers. The default of ``high`` excludes numbers that would fill the memory."""
     return _checked(int, lambda value: low <= value <= high, f"an integer from {low} to {high}")
 
 

@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"pnpnet: the demo runs without {missing}, which is not installed", file=sys.stderr)
     sets = evaluation_sets(sources, "none,2" if arguments.data else "none,uniform", n=_N, count=count, metric=metric)
     solvers = {specs[name]: load_solver(specs[name]) for name in _SOLVERS if name in specs}
-    torch.set_num_threads(1)  # more threads gain nothing with small tensors
+    torch.set_num_threads(1)  # small tensors gain nothing from more threads
     print(f"{count} problems of {_N} correspondences in each set, one thread:\n", flush=True)
     folder = Path(arguments.out)
     results = evaluate(solvers, sets, path=folder / "results.json", overwrite=True)

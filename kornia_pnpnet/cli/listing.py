@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-#: Descriptions of solvers. A solver has the description of the longest key that its name starts with.
+#: Descriptions of solvers by the start of their names. The longest matching key applies.
 _WHAT = {
     "pnpnet-set": "network over any number of pairs, then learned LM: the default",
     "pnpnet-n": "the paper's network for that number of pairs, then learned LM; camera near the world's axes",

@@ -32,8 +32,8 @@ class PeerPose(NamedTuple):
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
         inliers: whether the library reports a pair as an inlier, bool, shape :math:`(N,)`.
-        init: rotation and translation before the last refinement. ``None`` if the library does not report this pose;
-            the ``init`` of the result is then the final pose.
+        init: rotation and translation before the last refinement; ``None`` if the library does not report this pose.
+            With ``None``, ``PnPResult.init`` is the final pose.
     """
 
     rotation: np.ndarray
@@ -44,13 +44,12 @@ class PeerPose(NamedTuple):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class PeerSolver(nn.Module):
-    r"""A batched layer without gradients around a solver of another library, which solves one problem at a time.
+    r"""A batched layer around a solver of another library. The library solves one problem at a time.
 
-    A subclass implements :meth:`solve_one` and is a dataclass. Its fields are the arguments of its constructor. The
-    library gets the pairs that are present and have a weight above 0; the size of the weight has no effect. A problem
-    without a pose has ``ok=False``, and its pose is the identity. The library does not get problems with values that
-    are not finite, a negative weight, fewer than three pairs, a camera with skew, or a focal length that is not
-    positive.
+    A subclass is a dataclass that implements :meth:`solve_one`. The fields are the arguments of the constructor. The
+    library gets the pairs that are present and have a weight above 0, but not the weights. A problem without a pose has
+    ``ok=False``, and its pose is the identity. The library gets no problems with a value that is not finite,
+    a negative weight, fewer than three pairs, a camera with skew, or a focal length that is not positive.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
@@ -117,10 +116,10 @@ class PeerSolver(nn.Module):
         ``ShapeError``.
 
         Returns:
-            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. Its dtype is
-            float64 when an input is float64, else float32. Weights are 1 for the inliers that the library reports, else
-            0. The cost is the mean squared reprojection error in px² of the pairs that the library gets; each squared
-            error is truncated at the squared threshold.
+            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. The dtype is
+            float64 if an input is float64, else float32. A weight is 1 if the library reports the pair as an inlier,
+            else 0. The cost in px² is the mean squared reprojection error of the pairs that the library gets. A squared
+            error above the squared threshold counts as the squared threshold.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
         if inputs.rig is not None:
