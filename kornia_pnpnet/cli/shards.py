@@ -58,7 +58,7 @@ def solve_shards(
     overwrite: bool = False,
     progress: bool = False,
 ) -> ShardReport:
-    r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
+    r"""Solve shards of problems one after the other. The results of the shard ``part.*`` go to ``part.parquet``.
 
     A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`; at most ``batch``
     rows are read at a time. An NPZ shard is read as a whole. It has the arrays ``world_points`` (B, N, 3) and

@@ -46,16 +46,15 @@ class OutlierMix:
     Args:
         max_ratio: largest share of outliers. The largest number is rounded down: 0.33 gives n // 3 for n up to 15.
         count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
-        min_count: smallest number of outliers, at most the largest number of outliers.
+        min_count: smallest number of outliers, limited to the largest number of outliers.
         min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
         mismatch_share: probability that an outlier of no other kind is a *mismatch* and not a *sensing* outlier. The
             pixel of a mismatch shows another point. The pixel of a sensing outlier is uniform in the image.
         near_share: probability that an outlier is *near*. The pixel of a near outlier is close to the pixel of its
             point.
-        near_pixels: range, in pixels, of the distance of a near outlier's pixel from the pixel of its point,
-            log-uniform. The lower end is raised to
-            at least 5 standard deviations of the pixel noise, and the upper end to at least 10. ``None`` means 5 to 50
-            standard deviations.
+        near_pixels: range, in pixels, of the distance of a near outlier's pixel from the pixel of its point, drawn
+            log-uniform. The lower end is raised to at least 5 standard deviations of the pixel noise, and the upper end
+            to at least 10. ``None`` means 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
         structured_ratio: range from which each problem draws its ratio of structured outliers to inliers uniformly.

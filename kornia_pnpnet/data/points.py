@@ -224,7 +224,7 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """The multiples of ``rays``, (..., 3), at the entry to a box and at the exit. A ray with entry >= exit misses."""
+    """Multiples of ``rays``, (..., 3), where the rays enter and leave a box. If enter >= leave, a ray misses."""
     rays = torch.where(rays.abs() < _PARALLEL, _PARALLEL, rays)
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)

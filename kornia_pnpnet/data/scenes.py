@@ -99,8 +99,8 @@ class SceneProblems(RandomProblems):
     that are inliers of the scene are inliers of the problem. ``outliers=OutlierMix(count=2)`` is the protocol's real
     data with outliers. Points and poses do not depend on ``outliers``.
 
-    As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's prior, and the world is moved so that this
-    pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
+    As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
+    this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
         scene: the scene. Images with fewer than ``n + num_spares`` points are not used.

@@ -62,7 +62,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
     )
     indices: Any = iter(loader)
     # At exit, multiprocessing sends one SIGTERM to each worker and waits. Workers ignore the first SIGTERM, so this
-    # handler ends the workers of an open stream before.
+    # handler ends the workers first.
     atexit.register(indices._shutdown_workers)
     try:
         yield from map(slots.read, indices)

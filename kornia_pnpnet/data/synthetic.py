@@ -23,7 +23,8 @@ __all__ = ["SyntheticProblems"]
 #: A number, or a range: two numbers between which each problem draws a log-uniform number.
 Amount: TypeAlias = float | Sequence[float]
 
-# Smallest and largest value of each amount. Every amount may also be 0. Noise within the bounds is finite in float32.
+# Smallest and largest value of each amount. Every amount may also be 0. The
+# bounds of `degrees` and `sigma_spread` keep noise finite in float32.
 _AMOUNTS = {
     "img_sigma": (0.0, math.inf),
     "world_sigma": (0.0, math.inf),
@@ -77,8 +78,8 @@ class SyntheticProblems(RandomProblems):
         img_sigma: standard deviation of the noise on each pixel coordinate in pixels, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
         degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range; 0 means Gaussian noise. With
-            Student noise, ``img_sigma`` is the scale of the distribution, and pairs with pixel noise above ``10 *
-            img_sigma`` are outliers.
+            Student noise, ``img_sigma`` is the scale of the distribution. Pairs with more pixel noise than
+            ``10 * img_sigma`` are then outliers.
         sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. Above 0,
             known sigmas have the shape ``(batch_size, n)``.
         axis_ratio: anisotropy of the noise, at most 100: the largest standard deviation of a pair's noise along an
@@ -200,7 +201,7 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """Reorder points, (B, 2N, 3): pairs whose ``displaced``, (B, N), is false form a bunch in the image."""
+        """Reorder points, (B, 2N, 3). Pairs that are not ``displaced``, (B, N), get a bunch of points."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
         # The score of a point is the distance of its direction from the direction of the first point, plus blur.

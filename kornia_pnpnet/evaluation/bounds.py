@@ -33,8 +33,8 @@ def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResu
 class KnownInliers(Configured):
     r"""Least squares of the reprojection errors of the true inliers, starting from the true pose.
 
-    A method that must first find the inliers cannot expect a higher accuracy.
-    Source: the protocol's bound *known inliers*.
+    A method that must first find the inliers cannot expect a higher accuracy. Source: the protocol's bound *known
+    inliers*.
 
     Example:
         >>> from kornia_pnpnet.data import OutlierMix, SyntheticProblems

@@ -91,8 +91,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A pose that is not finite is replaced by the identity, with ``ok`` false. Errors are rounded to six
-    significant digits, and summaries are computed from the rounded errors.
+    A pose that is not finite is replaced by the identity, with ``ok`` false. Errors are rounded to six significant
+    digits, and summaries are computed from the rounded errors.
 
     With a ``path``, the results file is written after every row. A call with the same arguments, or with further
     solvers and data sets, continues the file. A file with rows of other code, versions, weights, configurations or

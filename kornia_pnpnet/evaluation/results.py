@@ -89,7 +89,7 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 
 
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Complete a plan, which is results without rows, with the rows of the file at ``path``, if the file exists.
+    """Add the rows of the file at ``path``, if the file exists, to ``plan``, which has no rows.
 
     Raises:
         ValueError: when the plan does not continue the file. Code, versions, and the solvers and data sets of the file
@@ -116,8 +116,7 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
 def format_table(results: Mapping[str, Any]) -> str:
     """Format results as a Markdown table with aligned columns.
 
-    A line has the set, the solver, the success with its 95 % interval, the median errors, the time and the share
-    ``ok``.
+    A line has the set, the solver, the success with its 95 % interval, median errors, time and share of ``ok``.
     """
     lines = []
     for row in results["rows"]:

@@ -48,8 +48,9 @@ class PeerSolver(nn.Module):
 
     A subclass is a dataclass that implements :meth:`solve_one`. The fields are the arguments of the constructor. The
     library gets the pairs that are present and have a weight above 0, but not the weights. A problem without a pose has
-    ``ok=False``, and its pose is the identity. The library gets no problems with a value that is not finite,
-    a negative weight, fewer than three pairs, a camera with skew, or a focal length that is not positive.
+    ``ok=False``, and its pose is the identity. A problem is not solved if it
+    has fewer than three pairs, a negative weight or a value that is not finite. A problem is also not solved if its
+    camera has skew or a focal length that is not positive.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 

@@ -68,9 +68,9 @@ class OpenCVRansac(_OpenCV, RobustPeer):
 
     The defaults are the best of a grid with thresholds from 30 to 120 px. The grid used 3000 problems of the protocol
     with another seed, without and with outliers. At the focal length of 3400 px, the noise of a close world point moves
-    the pixel by 17 px. World points with less noise need a lower threshold. With noisy world points, ``method="SQPNP",
-    refine=False`` solves more problems than the defaults, because SQPnP minimises an error in space and not in the
-    image. With these options, a problem takes several times as long as with the defaults.
+    the pixel by 17 px. World points with less noise need a lower threshold. With noisy world points, the options
+    ``method="SQPNP", refine=False`` solve more problems than the defaults, because SQPnP minimises an error in space
+    and not in the image. With these options, a problem takes several times as long as with the defaults.
 
     Args:
         threshold: largest reprojection error of an inlier in pixels.
