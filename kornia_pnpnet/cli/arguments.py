@@ -57,7 +57,7 @@ _picture = _checked(Path, lambda path: path.suffix.lower() in (".pdf", ".png", "
 
 
 def _counts(text: str) -> list[int]:
-    """Parse integers of at least 1, separated by commas, without duplicates."""
+    """Parse integers of at least 1 that are separated by commas, and drop duplicates."""
     return list(dict.fromkeys(map(_whole(1), text.split(","))))
 
 

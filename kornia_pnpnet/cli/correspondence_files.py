@@ -24,7 +24,7 @@ _COLUMNS = ("X", "Y", "Z", "u", "v")
 _ZIP_MAGIC = b"PK\x03\x04"
 # Ratio of the standard deviation of a normal distribution to its median absolute deviation.
 _MAD_TO_SIGMA = 1.4826
-# Smallest automatic limit of a reprojection error, in pixels: three standard deviations of a corner detector's noise.
+# Smallest automatic rejection limit in pixels: three standard deviations of a corner detector's noise.
 _MIN_LIMIT_PX = 3.0
 
 

@@ -29,7 +29,7 @@ _WHAT = {
 
 
 def run(_: argparse.Namespace) -> int:
-    """Print the description of each solver, and the package to install if it is missing."""
+    """Print the description of each solver, and the package that must be installed, if any."""
     from kornia_pnpnet import list_solvers, shipped_weights
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package
 

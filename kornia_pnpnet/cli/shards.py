@@ -60,10 +60,10 @@ def solve_shards(
 ) -> ShardReport:
     r"""Solve shards of problems one after the other. The results of the shard ``part.*`` go to ``part.parquet``.
 
-    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`; at most ``batch``
-    rows are read at a time. An NPZ shard is read as a whole. It has the arrays ``world_points`` (B, N, 3) and
-    ``img_points`` (B, N, 2). Optional arrays are ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and the
-    standard deviations ``img_sigma`` and ``world_sigma``, each of the shape (), (B,) or (B, N).
+    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. At most ``batch``
+    rows are read at a time. An NPZ shard is read as a whole and has the arrays ``world_points`` (B, N, 3) and
+    ``img_points`` (B, N, 2). Optional arrays are ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma``
+    and ``world_sigma``. Each sigma has the shape (), (B,) or (B, N).
 
     A results file appears when it is complete. A repeated call skips the shards that have results. A shard that cannot
     be read is reported, and the other shards are solved.
@@ -105,7 +105,7 @@ def solve_shards(
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
-    """Find all shards, by the stem of their names. Shards of a folder are sorted by name."""
+    """Find all shards. The keys are the stems of their names. Shards of a folder are sorted by name."""
     shards: dict[str, Path] = {}
     endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):

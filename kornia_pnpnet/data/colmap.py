@@ -29,9 +29,9 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
     twice, the first pixel is used. Points behind the camera are dropped. All pairs of a model count as inliers.
 
     A file of matches is an ``.npz`` file of V images. The file has the arrays ``names`` (V,), ``K`` (V, 3, 3),
-    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2), which is width and height. Further names start with the index of
-    an image in three digits. For example, the M matches of image 7 are ``007_img_points`` (M, 2), ``007_world_points``
-    (M, 3) and ``007_error_px`` (M,). The error is the reprojection error under the true pose.
+    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2), which is width and height. All other names start with the index
+    of an image in three digits. For example, the M matches of image 7 are ``007_img_points`` (M, 2),
+    ``007_world_points`` (M, 3) and ``007_error_px`` (M,). The error is the reprojection error under the true pose.
 
     Args:
         path: the folder or the file.
@@ -113,7 +113,7 @@ def _pinhole(camera: Any, distorted: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _find_model(folder: Path) -> Path:
-    """Return the first of ``_MODEL_FOLDERS`` in which the three files of a model have the same format."""
+    """Return the first folder of ``_MODEL_FOLDERS`` that has the three files of a model in one format."""
     for below, ending in product(_MODEL_FOLDERS, (".bin", ".txt")):
         if all((folder / below / f"{stem}{ending}").is_file() for stem in ("cameras", "images", "points3D")):
             return folder / below
@@ -127,7 +127,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
     pycolmap = _pycolmap()
     try:
         model = pycolmap.Reconstruction(str(place))
-    except Exception as error:  # pycolmap raises many types on bad files, MemoryError included
+    except Exception as error:  # pycolmap raises many types of errors on bad files, also MemoryError
         raise ValueError(f"pycolmap cannot read the model: {_line(error)}") from error
     xyz_of = {number: point.xyz for number, point in model.points3D.items()}
     for image in model.images.values():

@@ -20,7 +20,7 @@ __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "struct
 # First, the range without `near_pixels`. Second, the smallest values of the two ends of `near_pixels`.
 # A choice: the noise itself hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
-# Added to n * max_ratio before rounding down. With 0.33 the result is then floor(n / 3) for n up to 15.
+# This number is added to n * max_ratio before rounding down. With 0.33 the result is then floor(n / 3) for n up to 15.
 _SLACK = 0.05
 
 
@@ -44,7 +44,7 @@ class OutlierMix:
     assigned in the order structured, near, crowd, mismatch. Each share applies to the outliers that have no kind yet.
 
     Args:
-        max_ratio: largest share of outliers. The largest number is rounded down: 0.33 gives n // 3 for n up to 15.
+        max_ratio: largest share of outliers. The largest count is rounded down: 0.33 gives n // 3 for n up to 15.
         count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
         min_count: smallest number of outliers, limited to the largest number of outliers.
         min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
@@ -60,11 +60,11 @@ class OutlierMix:
         structured_ratio: range from which each problem draws its ratio of structured outliers to inliers uniformly.
         structured_angle: largest rotation angle in radians. The pixels of structured outliers show a rotated and
             shifted copy of the problem's points.
-        mirrored_share: probability that a problem also mirrors the copy that structured outliers show.
+        mirrored_share: probability that a problem also mirrors the copy of the points for its structured outliers.
         crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
             leader. Each problem draws the probability that an outlier joins a crowd uniformly from 0 to 1.
-        max_crowds: largest number of crowds. Each problem draws the number uniformly from 1 to ``max_crowds``.
-        point_crowd_share: probability that all crowds of a problem share the leader's world point instead of its pixel.
+        max_crowds: largest number of crowds. Each problem draws its number uniformly from 1 to ``max_crowds``.
+        point_crowd_share: probability that all crowds of a problem have the leaders' world points, not their pixels.
 
     Raises:
         BaseError: for a number or a range out of its bounds.

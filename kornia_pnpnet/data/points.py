@@ -154,12 +154,12 @@ class FacadePoints(_View):
     """Points of one façade, or of two façades that meet at a corner, with relief.
 
     Each façade is a plane that is turned away from the camera by a random angle. A random half of the points lies
-    deeper by the relief, like recesses between balconies. All depths also get normal noise with a tenth of the relief
-    as the standard deviation.
+    deeper by the relief, as in recesses. All depths also get normal noise with a tenth of the relief as the standard
+    deviation.
 
     Args:
         field_of_view: range of the field of view of the square image in degrees, uniform.
-        window: range of the area of the window relative to the image, log-uniform. All points lie in the window.
+        window: range of the ratio of the window's area to the image's area, log-uniform. All points lie in the window.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:

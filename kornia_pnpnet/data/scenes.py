@@ -95,8 +95,8 @@ class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
     Each problem consists of ``n`` random points of a random image and their pixels. The pixel of a *mismatch* is the
-    pixel of a spare point of the same image. The pixel of a *sensing* outlier is uniform in the image. All other pairs
-    that are inliers of the scene are inliers of the problem. ``outliers=OutlierMix(count=2)`` is the protocol's real
+    pixel of a spare point of the same image. The pixel of a *sensing* outlier is uniform in the image. Every other pair
+    that is an inlier of its image is an inlier of the problem. ``outliers=OutlierMix(count=2)`` is the protocol's real
     data with outliers. Points and poses do not depend on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that

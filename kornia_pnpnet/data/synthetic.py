@@ -23,8 +23,8 @@ __all__ = ["SyntheticProblems"]
 #: A number, or a range: two numbers between which each problem draws a log-uniform number.
 Amount: TypeAlias = float | Sequence[float]
 
-# Smallest and largest value of each amount. Every amount may also be 0. The
-# bounds of `degrees` and `sigma_spread` keep noise finite in float32.
+# Smallest and largest value of each amount. Every amount may also be 0. The bounds of `degrees` and `sigma_spread` keep
+# noise finite in float32.
 _AMOUNTS = {
     "img_sigma": (0.0, math.inf),
     "world_sigma": (0.0, math.inf),
@@ -73,7 +73,7 @@ class SyntheticProblems(RandomProblems):
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels; the principal point is 0.
         half_image: half the side of the image in pixels. The pixels of *sensing* outliers are uniform in the image, a
-            square about 0. ``None`` means the smallest square that contains the pixels of all points of a problem, but
+            square about 0. ``None`` means the smallest square that contains the pixels of all points of a problem, with
             a field of view of at most 120°.
         img_sigma: standard deviation of the noise on each pixel coordinate in pixels, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
@@ -82,16 +82,16 @@ class SyntheticProblems(RandomProblems):
             ``10 * img_sigma`` are then outliers.
         sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. Above 0,
             known sigmas have the shape ``(batch_size, n)``.
-        axis_ratio: anisotropy of the noise, at most 100: the largest standard deviation of a pair's noise along an
-            axis, divided by the smallest. Each pair has random axes. Above 1, ``img_sigma`` and ``world_sigma`` are
-            root mean squares over the axes, and known noise is given as covariances.
+        axis_ratio: ratio of the largest to the smallest standard deviation over the axes of a pair's noise, at most
+            100. Each pair has random axes. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the
+            axes, and known noise is given as covariances.
         known_noise: share of the problems that have both sigmas. With 0, batches have no sigmas. Above 0, a third of
             the other problems have one sigma, and missing sigmas are NaN. With an ``axis_ratio`` above 1, the share
             must be 0 or 1.
         confidence_share: share of the problems that have confidences; other problems have NaN. With 0, batches have no
             confidences. The separation of inliers from outliers and the scale of the logits differ between problems.
-        bunched_share: share of the problems with a bunch: inliers, *near* and *structured* outliers lie in a part of
-            the image. The points of other outliers come from the rest of the scene.
+        bunched_share: share of the problems with a bunch. In these problems, inliers, *near* and *structured* outliers
+            lie in a part of the image. The points of other outliers come from the rest of the scene.
         dtype: dtype of the batches; numbers are drawn in float64.
         device: device of the batches; numbers are drawn on the CPU.
 
@@ -201,7 +201,7 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """Reorder points, (B, 2N, 3). Pairs that are not ``displaced``, (B, N), get a bunch of points."""
+        """Reorder points, (B, 2N, 3). Pairs that are not ``displaced``, (B, N), get the points of a bunch."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
         # The score of a point is the distance of its direction from the direction of the first point, plus blur.

@@ -88,7 +88,7 @@ class KnownInliersAndNoise(Configured):
 
     @torch.no_grad()  # else the gradient of a NaN point would be NaN for all points
     def _inverse_variances(self, problems: Problems) -> Tensor:
-        """The weight of each pair in 1/px², 0 for an outlier, (B, N)."""
+        """The weight of each pair in 1/px², (B, N); 0 for outliers."""
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # the solver ignores points behind the camera

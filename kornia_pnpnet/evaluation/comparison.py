@@ -153,7 +153,7 @@ def evaluate(
     results["left_out"] = []
     elsewhere = {key: here[key] for key in _MACHINE if results["environment"].get(key) != here[key]}
     if path is not None:
-        save_results(results, path)  # a path that cannot be written fails here, before the work
+        save_results(results, path)  # an error of writing appears here, before the work
 
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}

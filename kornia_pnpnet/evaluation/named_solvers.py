@@ -36,7 +36,7 @@ _SCENE_OPTIONS = dict.fromkeys(
 # Options of RANSAC for synthetic data. The thresholds are the best of a grid from (3 px, 0.15 m) to (8 px, 0.4 m), on
 # problems of another seed. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Module and name of each optional package, by the start of the names of its solvers.
+# Optional packages by the start of solver names: module and name of the package.
 _PACKAGES = {
     "opencv-": ("cv2", "OpenCV"),
     "kornia-rs": ("kornia_rs", "kornia-rs"),

@@ -32,7 +32,7 @@ __all__ = ["plot_errors", "plot_pose", "plot_success", "plot_training"]
 #: Colours that colour-blind readers can tell apart: the palette ``colorblind`` of seaborn.
 COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161", "#fbafe4", "#949494", "#ece133", "#56b4e9")
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-WIDTH = 7.2  #: inches: the text width of a page with two columns
+WIDTH = 7.2  #: Inches. The text width of a page with two columns.
 #: Settings of matplotlib while a picture is drawn. ``text.parse_math`` is off: names of solvers are not formulas.
 THEME: Any = {
     **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "figure.titlesize"), 9.0),

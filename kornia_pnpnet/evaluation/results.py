@@ -89,7 +89,7 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 
 
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Add the rows of the file at ``path``, if the file exists, to ``plan``, which has no rows.
+    """Fill ``plan``, which has no rows, with the rows of the file at ``path``. A missing file is ignored.
 
     Raises:
         ValueError: when the plan does not continue the file. Code, versions, and the solvers and data sets of the file

@@ -73,7 +73,7 @@ class PeerSolver(nn.Module):
             self.library()
 
     def library(self) -> ModuleType:
-        """Import the library; the ``ImportError`` of a missing library names the extra to install."""
+        """Import the library, or raise an ``ImportError`` that names the extra to install."""
         assert self.source is not None
         module, name = self.source
         try:
@@ -175,7 +175,7 @@ class PeerSolver(nn.Module):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class RobustPeer(PeerSolver):
-    """A peer that draws random samples. For its arguments see ``OpenCVRansac``.
+    """A peer that draws random samples. For the arguments see ``OpenCVRansac``.
 
     Raises:
         BaseError: for a ``threshold``, ``confidence``, ``seed`` or number of iterations out of range.
@@ -196,7 +196,7 @@ class RobustPeer(PeerSolver):
 
 
 def _squared_errors(poses: Tensor, world: Tensor, img: Tensor, cameras: Tensor) -> Tensor:
-    """The squared reprojection errors in px², infinite for points behind the camera, (B, N)."""
+    """The squared reprojection errors in px², (B, N); infinite for points behind the camera."""
     cam_points = world @ poses[..., :3].mT + poses[:, None, :, 3]
     in_front = cam_points[..., 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ cameras.mT, eps=0.0)

@@ -1,4 +1,4 @@
-"""Means to stop, continue and watch a run: signals, checkpoints, learning curves and times of stages."""
+"""Stopping, continuing and watching a run: signals, checkpoints, learning curves and times of stages."""
 
 from __future__ import annotations
 

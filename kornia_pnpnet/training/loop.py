@@ -152,7 +152,7 @@ def fit(
         folder: folder of the run.
         fabric: a launched Fabric; one process on the CPU when ``None``.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
-            only with equal data.
+            only with an equal ``identity``.
         data_workers: number of worker processes for each training process, see
             :func:`~kornia_pnpnet.data.stream.stream_batches`.
         resume: continue from the checkpoint in ``folder`` if it exists.
@@ -219,7 +219,7 @@ def fit(
             fabric.backward(terms.total + 0.0 * unused)
             clock.lap("backward")
             norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
-            # All processes must take the same branch, even if only one process has a bad number or got the signal.
+            # All processes must take the same branch, even if only one process has a bad loss or got a signal.
             bad, stopped = _any_process(fabric, ~torch.isfinite(terms.total + norm), stop.is_set())
             if bad:
                 skipped += 1

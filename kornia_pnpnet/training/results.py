@@ -75,8 +75,8 @@ class FitReport:
 class ValidationResult:
     """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
 
-    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translation errors are
-    in the unit of the world.
+    Fields with ``first_stage`` describe the initial poses. The other fields describe the refined poses. Translation
+    errors are in the unit of the world.
     """
 
     success: SuccessRate
@@ -95,7 +95,7 @@ class Learned(NamedTuple):
     robustness: list[float]
 
 
-# The keys that model cards and summaries read. The mappings have further keys.
+# The keys that model cards and summaries read. The mappings can have further keys.
 _Init = TypedDict("_Init", {"name": str})
 _Refine = TypedDict("_Refine", {"m": Count})
 _Size = TypedDict("_Size", {"n": Count})
