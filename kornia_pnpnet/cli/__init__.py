@@ -2,7 +2,7 @@
 
 A command is a module in :data:`COMMANDS`. The docstring of the module is the command's help, and ``run(arguments)``
 returns the exit code. :data:`kornia_pnpnet.cli.arguments.ARGUMENTS` has the arguments of each command. The modules
-import PyTorch inside ``run``, because the import takes seconds and bad arguments are to be reported at once.
+import PyTorch inside ``run``, because the import takes seconds and errors in arguments should appear at once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The arguments of all commands as one table, the parser of these arguments, and the solver named by an argument."""
+"""The arguments of all commands in one table, their parser, and the solver for ``--solver``."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: st
 
 
 def _whole(low: int, high: int = 10**8) -> Callable[[str], int]:
-    """Make a parser of integers. The default of ``high`` keeps huge numbers of problems from filling the memory."""
+    """Make a parser of integers. The default of ``high`` excludes numbers that would fill the memory."""
     return _checked(int, lambda value: low <= value <= high, f"an integer from {low} to {high}")
 
 
@@ -57,7 +57,7 @@ _picture = _checked(Path, lambda path: path.suffix.lower() in (".pdf", ".png", "
 
 
 def _counts(text: str) -> list[int]:
-    """Parse integers of at least 1, separated by commas, without duplicates."""
+    """Parse integers of at least 1 that are separated by commas, and drop duplicates."""
     return list(dict.fromkeys(map(_whole(1), text.split(","))))
 
 

@@ -1,4 +1,4 @@
-"""The correspondences of one image: reading files and cameras of the command line, and reprojection errors."""
+"""Reading the correspondences and the camera of one image, and computing reprojection errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _COLUMNS = ("X", "Y", "Z", "u", "v")
 _ZIP_MAGIC = b"PK\x03\x04"
 # Ratio of the standard deviation of a normal distribution to its median absolute deviation.
 _MAD_TO_SIGMA = 1.4826
-# Smallest automatic limit of a reprojection error, in pixels: three standard deviations of a corner detector's noise.
+# Smallest automatic rejection limit in pixels: three standard deviations of a corner detector's noise.
 _MIN_LIMIT_PX = 3.0
 
 
@@ -44,7 +44,7 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort the pixels, and set the intrinsics to those of the pinhole camera.
+        """Undistort the pixels, and use the intrinsics of the undistorted pinhole camera.
 
         A pixel that cannot be undistorted gets the weight 0. For ``camera`` see
         ``kornia_pnpnet.data.colmap.undistort``.
@@ -137,7 +137,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the arrays with one of ``names`` from an NPZ file; ``InputError`` without both arrays of points."""
+    """Read the arrays with the given names; ``InputError`` if ``world_points`` or ``img_points`` is missing."""
     try:
         arrays = read_npz(path, names)
     except ValueError as error:
@@ -151,12 +151,12 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 def reproject(
     world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, limit_px: float | None = None
 ) -> tuple[Tensor, Tensor, float]:
-    """Reproject the world points (N, 3) of one image by a pose (a batch of one) and compare with the pixels (N, 2).
+    """Compute the reprojection errors of one image. ``pose`` is a batch of one pose.
 
     Returns:
-        The reprojections (N, 2), the reprojection errors (N,), and the largest error of a correspondence that is not
-        rejected, all in pixels. Reprojections and errors are NaN for points that are not in front of the camera. The
-        limit is ``limit_px``; when ``None``, it is 3 times 1.4826 times the median error, at least 3 px.
+        Three values in pixels: the reprojections (N, 2), the reprojection errors (N,), and the largest accepted error.
+        Reprojections and errors are NaN for points that are not in front of the camera. If ``limit_px`` is ``None``,
+        the largest accepted error is 3 times 1.4826 times the median error, but at least 3 px.
     """
     cam_points = transform_points(pose.matrix, world_points[None])[0]
     in_front = cam_points[:, 2:] > 0

@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"pnpnet: the demo runs without {missing}, which is not installed", file=sys.stderr)
     sets = evaluation_sets(sources, "none,2" if arguments.data else "none,uniform", n=_N, count=count, metric=metric)
     solvers = {specs[name]: load_solver(specs[name]) for name in _SOLVERS if name in specs}
-    torch.set_num_threads(1)  # more threads gain nothing with small tensors
+    torch.set_num_threads(1)  # small tensors gain nothing from more threads
     print(f"{count} problems of {_N} correspondences in each set, one thread:\n", flush=True)
     folder = Path(arguments.out)
     results = evaluate(solvers, sets, path=folder / "results.json", overwrite=True)
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def verdict(results: Mapping[str, Any]) -> str:
-    """Name the solvers that solved the most problems of each set, and the fastest solver, in one sentence.
+    """Name, for each set, the solvers that solved the most problems, and the fastest solver.
 
     Solvers whose 95 % interval contains the highest success rate share the first place.
     """
@@ -73,7 +73,7 @@ def _result(row: Mapping[str, Any]) -> str:
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first problem with the most outliers, so that the choice does not depend on success."""
+    """Draw the first problem with the most outliers. This choice does not depend on the solver."""
     import torch
 
     from kornia_pnpnet.cli.correspondence_files import reproject
@@ -89,7 +89,7 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
-    """Train briefly and print the first and last success rates; ``None`` without the packages for training."""
+    """Train briefly and print the success rates of the first and last validation; ``None`` if a package is missing."""
     from kornia_pnpnet.core.files import read_csv
 
     try:

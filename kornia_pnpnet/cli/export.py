@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")
-    target.parent.mkdir(parents=True, exist_ok=True)  # an error comes now, not after minutes of tracing
+    target.parent.mkdir(parents=True, exist_ok=True)  # an error appears here, before minutes of tracing
     if target.is_dir():
         raise ValueError(f"'{target}' is a folder")
     if target.exists() and not arguments.overwrite:

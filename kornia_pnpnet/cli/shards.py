@@ -1,4 +1,4 @@
-"""Files of many problems, solved one after the other in bounded memory: ``pnpnet solve --batch``."""
+"""Solving many files of problems in bounded memory: ``pnpnet solve --batch``."""
 
 from __future__ import annotations
 
@@ -58,15 +58,15 @@ def solve_shards(
     overwrite: bool = False,
     progress: bool = False,
 ) -> ShardReport:
-    r"""Solve shards of problems one after the other, and write the results of ``part.*`` to ``part.parquet``.
+    r"""Solve shards of problems one after the other. The results of the shard ``part.*`` go to ``part.parquet``.
 
-    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`; at most ``batch``
-    rows are read at a time. An NPZ shard is read as a whole. It has the arrays ``world_points`` (B, N, 3) and
-    ``img_points`` (B, N, 2). Optional arrays are ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), and the
-    standard deviations ``img_sigma`` and ``world_sigma``, each of the shape (), (B,) or (B, N).
+    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. At most ``batch``
+    rows are read at a time. An NPZ shard is read as a whole and has the arrays ``world_points`` (B, N, 3) and
+    ``img_points`` (B, N, 2). Optional arrays are ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma``
+    and ``world_sigma``. Each sigma has the shape (), (B,) or (B, N).
 
-    A results file gets its name when it is complete. A stopped call can therefore be repeated, and shards with results
-    are skipped. A shard that cannot be read is reported, and the other shards are solved.
+    A results file appears when it is complete. A repeated call skips the shards that have results. A shard that cannot
+    be read is reported, and the other shards are solved.
 
     Args:
         solve: the solver.
@@ -105,7 +105,7 @@ def solve_shards(
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
-    """Find all shards, by the stem of their names. Shards of a folder are sorted by name."""
+    """Find all shards. The keys are the stems of their names. Shards of a folder are sorted by name."""
     shards: dict[str, Path] = {}
     endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):
@@ -165,8 +165,8 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
     """Yield tables of at most ``batch`` rows from a Parquet file, at least one table."""
     try:
-        # With pre_buffer Arrow would read ahead to the end of the file. Without buffer_size it would read a whole row
-        # group at once.
+        # With pre_buffer Arrow would read ahead to the end of the file. Without buffer_size, Arrow would read a whole
+        # row group at once.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
             groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
             numbers = [sum(x.column(i).num_values for i in range(x.num_columns)) // max(x.num_rows, 1) for x in groups]

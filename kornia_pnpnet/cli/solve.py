@@ -43,7 +43,7 @@ _ADVICE = {
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Solve one image or, with ``--batch``, shards."""
+    """Solve one image, or the shards of ``--batch``."""
     from kornia_pnpnet.cli.correspondence_files import camera_matrix
 
     if arguments.camera and (arguments.intrinsics or arguments.focal or arguments.batch):

@@ -1,9 +1,8 @@
 """Sources of problems: synthetic problems and real scenes.
 
-``synthetic`` makes problems from ``points`` (priors of points), ``outliers`` (the number and kinds of outliers) and
-``draws`` (random poses and numbers). ``cameras`` makes problems of many cameras. ``mixtures`` combines several sources.
-``scenes`` draws problems from real scenes, and ``colmap`` reads such scenes from files. ``stream`` draws batches in
-worker processes. A new source is a class with ``batch_size`` and ``batch(index)``.
+A source is a class with ``batch_size`` and ``batch(index)``. The modules ``synthetic``, ``cameras``, ``mixtures`` and
+``scenes`` contain sources. ``points``, ``outliers`` and ``draws`` draw points, outliers and poses. ``colmap`` reads
+scenes from files. ``stream`` draws batches in worker processes.
 """
 
 from kornia_pnpnet.data.cameras import CameraProblems

@@ -18,7 +18,8 @@ from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["CameraProblems"]
 
-# Smallest and largest mean depth of a problem, in the unit of the world. A choice: solvers do not depend on the unit.
+# Smallest and largest mean depth of a problem, in the unit of the world. The values are arbitrary: solvers do not
+# depend on the unit.
 _NEAREST, _FARTHEST = 2.0, 50.0
 # Half the side of the square image, in pixels.
 _HALF_IMAGE = 1000.0
@@ -28,20 +29,20 @@ _HALF_IMAGE = 1000.0
 class CameraProblems(RandomProblems):
     r"""Random problems of cameras with random fields of view.
 
-    Pixels are uniform in an image of 2000 x 2000 pixels with the principal point in its middle. The mean depth of a
-    problem is log-uniform from 2 to 50, and the depths are uniform about the mean depth. The pixels of outliers are
-    uniform in the image. The viewing directions of a rig's cameras are spread evenly about the rig's vertical axis. The
-    camera centres are random points on a sphere about the rig's origin. Pair i belongs to camera i modulo ``cameras``.
+    The image has 2000 x 2000 pixels, and the principal point is its centre. The pixels of inliers and of outliers are
+    uniform in the image. The mean depth of a problem is log-uniform from 2 to 50. The cameras of a rig look in
+    directions that are spread evenly about the rig's vertical axis. The camera centres are random points on a sphere
+    about the rig's origin. Pair ``i`` belongs to camera ``i % cameras``.
 
     Args:
         n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`~kornia_pnpnet.data.SyntheticProblems`.
-        field_of_view: range of the horizontal field of view in degrees, uniform for each camera.
-        depth_spread: range of the largest distance of a depth from the mean depth, relative to the mean depth; uniform
-            for each problem.
+        field_of_view: range, in degrees, from which each camera draws its horizontal field of view uniformly.
+        depth_spread: range from which each problem draws its spread uniformly. Depths divided by the mean depth are
+            uniform from ``1 - spread`` to ``1 + spread``.
         outlier_share: share of the pairs that are outliers. The number of outliers is rounded to an integer.
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
-        cameras: number of cameras of the rig. With 1 there is no rig; with more, batches have ``cam_from_rig``.
+        cameras: number of cameras. Two or more cameras form a rig, and batches then have ``cam_from_rig``.
         baseline: distance of the camera centres from the origin of the rig, relative to the mean depth.
 
     Raises:
@@ -98,7 +99,7 @@ class CameraProblems(RandomProblems):
         return Problems(world_points, pixels, intrinsics if rig else intrinsics[:, 0], pose, inliers, cam_from_rig=rig)
 
     def _rig(self, distance: Tensor, generator: torch.Generator) -> Pose:
-        """The transforms from the rig's frame to the frame of each camera, (B, C, 3, 3) and (B, C, 3)."""
+        """Draw the transform from the rig's frame to the frame of each camera, (B, C, 3, 3) and (B, C, 3)."""
         heading = torch.arange(self.cameras).double()[:, None] * (2.0 * math.pi / self.cameras)
         rotation = axis_angle_to_rotation_matrix(pad(heading, (1, 1))).expand(self.batch_size, -1, -1, -1)
         centres = normalize(normal((self.batch_size, self.cameras, 3), generator), dim=-1)

@@ -16,7 +16,7 @@ from kornia_pnpnet.data.scenes import Scene, View
 
 __all__ = ["load_scene", "undistort"]
 
-# Where a model is looked for, relative to the user's folder: the folder itself, ETH3D's layout, COLMAP's layout.
+# Possible folders of a model, relative to the user's folder: the folder itself, ETH3D's layout, COLMAP's layouts.
 _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 
 
@@ -26,19 +26,18 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
     ``pycolmap`` reads a model in text or binary format. The model is in the folder ``path`` or in its sub-folder
     ``dslr_calibration_undistorted`` (ETH3D), ``sparse/0`` or ``sparse`` (COLMAP). Pixels of distorted cameras are
     undistorted to the pinhole camera with the same focal length and principal point. If an image observes a point
-    twice, the first pixel is used. Points behind the camera, which a fisheye lens can see, are dropped. All pairs of a
-    model count as inliers.
+    twice, the first pixel is used. Points behind the camera are dropped. All pairs of a model count as inliers.
 
-    A file of matches is an ``.npz`` file with the arrays ``names`` (V,), ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3)
-    and ``size`` (V, 2) as width and height. The matches of the image with the index ``iii`` (three digits) are
-    ``iii_img_points`` (M, 2), ``iii_world_points`` (M, 3) and ``iii_error_px`` (M,), the reprojection error under the
-    true pose. The file is read without unpickling.
+    A file of matches is an ``.npz`` file of V images. The file has the arrays ``names`` (V,), ``K`` (V, 3, 3),
+    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2), which is width and height. All other names start with the index
+    of an image in three digits. For example, the M matches of image 7 are ``007_img_points`` (M, 2),
+    ``007_world_points`` (M, 3) and ``007_error_px`` (M,). The error is the reprojection error under the true pose.
 
     Args:
         path: the folder or the file.
         metric: whether the unit of the scene is the metre.
         min_points: images with fewer points are skipped.
-        max_error_px: largest reprojection error of an inlier in a file of matches, in pixels.
+        max_error_px: in a file of matches, the largest reprojection error of an inlier, in pixels.
 
     Raises:
         FileNotFoundError: if ``path`` does not exist or the folder has no model.
@@ -73,8 +72,8 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         img_points: distorted pixels, shape (N, 2).
 
     Returns:
-        The matrix of the pinhole camera with the same focal length and principal point, shape (3, 3), and the
-        undistorted pixels, shape (N, 2), both float64. A pixel that the camera model cannot undistort becomes NaN.
+        Two float64 tensors. The first, (3, 3), is the matrix of the pinhole camera with the same focal length and
+        principal point. The second, (N, 2), has the undistorted pixels, NaN where the camera model has no inverse.
 
     Raises:
         ImportError: if ``pycolmap`` is missing.
@@ -106,7 +105,7 @@ def _line(error: Exception) -> str:
 
 
 def _pinhole(camera: Any, distorted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pinhole matrix (3, 3) of a ``pycolmap.Camera`` and the undistorted pixels (M, 2); see :func:`undistort`."""
+    """See :func:`undistort`; ``camera`` is a ``pycolmap.Camera``."""
     intrinsics = camera.calibration_matrix()
     plane = camera.cam_from_img(distorted)  # (M, 2), NaN where the camera model has no inverse
     with np.errstate(invalid="ignore"):  # a focal length of 0 makes `plane` infinite
@@ -114,7 +113,7 @@ def _pinhole(camera: Any, distorted: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _find_model(folder: Path) -> Path:
-    """The folder at or below ``folder`` with the three files of a model, all of them binary or all of them text."""
+    """Return the first folder of ``_MODEL_FOLDERS`` that has the three files of a model in one format."""
     for below, ending in product(_MODEL_FOLDERS, (".bin", ".txt")):
         if all((folder / below / f"{stem}{ending}").is_file() for stem in ("cameras", "images", "points3D")):
             return folder / below
@@ -128,12 +127,12 @@ def _colmap_views(folder: Path) -> Iterator[View]:
     pycolmap = _pycolmap()
     try:
         model = pycolmap.Reconstruction(str(place))
-    except Exception as error:  # pycolmap raises many types on bad files, MemoryError included
+    except Exception as error:  # pycolmap raises many types of errors on bad files, also MemoryError
         raise ValueError(f"pycolmap cannot read the model: {_line(error)}") from error
     xyz_of = {number: point.xyz for number, point in model.points3D.items()}
     for image in model.images.values():
         observed = image.get_observation_points2D()
-        pixel_of = {point.point3D_id: point.xy for point in reversed(observed)}  # reversed: the first pixel wins
+        pixel_of = {point.point3D_id: point.xy for point in reversed(observed)}  # keeps the first pixel of a point
         numbers = sorted(pixel_of)
         if missing := pixel_of.keys() - xyz_of.keys():
             raise ValueError(f"image '{image.name}' observes the point {min(missing)}, which the model lacks")
@@ -142,7 +141,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
         intrinsics, pixels = _pinhole(image.camera, distorted)
         world_to_cam = image.cam_from_world().matrix()  # (3, 4)
         depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
-        # `~(depth <= 0)` keeps NaN depths, so that View refuses a pose that is not finite.
+        # `~(depth <= 0)` keeps NaN depths. View then refuses the pose, which is not finite.
         seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
         arrays = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
         world, img, camera, rotation, translation = map(torch.tensor, arrays)
@@ -168,7 +167,7 @@ def _match_views(path: Path, max_error_px: float) -> Iterator[View]:
 
 
 def _numbers(arrays: Mapping[str, np.ndarray], key: str, *shape: int | None) -> Tensor:
-    """Read an array of numbers as float64 and check its shape, in which ``None`` stands for any size."""
+    """Read a numeric array as float64 and check its shape; ``None`` in ``shape`` allows any size."""
     if key not in arrays:
         raise ValueError(f"there is no array '{key}'")
     array = arrays[key]

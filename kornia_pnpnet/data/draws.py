@@ -1,4 +1,4 @@
-"""The base class of random sources, the random generator of a batch, random numbers in float64, and random poses."""
+"""Random numbers and poses in float64, and the base class of random sources."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["RandomProblems", "batch_generator", "log_uniform", "normal", "random
 
 @dataclass(kw_only=True, eq=False)
 class RandomProblems:
-    """Base class of endless, reproducible sources. Fields: see :class:`~kornia_pnpnet.data.SyntheticProblems`."""
+    """Base class of random sources. For the fields see :class:`~kornia_pnpnet.data.SyntheticProblems`."""
 
     n: int = 9
     batch_size: int = 1000
@@ -38,7 +38,7 @@ class RandomProblems:
         return map(self.batch, count())
 
     def batch(self, index: int) -> Problems:
-        """Draw batch ``index``, at least 0."""
+        """Draw a batch; the first index is 0."""
         problems = self._draw(batch_generator(self.seed, index))
         return problems.map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
 
@@ -49,7 +49,7 @@ class RandomProblems:
 def batch_generator(seed: int, index: int) -> torch.Generator:
     """Make the random generator of a batch; equal arguments give equal random numbers.
 
-    ``seed`` and ``index`` are hashed into one seed, because CPU generators use only 32 bits of a seed.
+    ``seed`` and ``index`` are hashed into one number, because CPU generators use only 32 bits of their seed.
     """
     state = int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0])
     return torch.Generator().manual_seed(state >> 1)

@@ -21,8 +21,7 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["MixedPoints", "MixedProblems", "VaryingSize"]
 
-# Added to the stream's seed to get the seed that draws the numbers of pairs. The offset is large, because the sources
-# use the stream's seed and the seeds directly after the stream's seed.
+# The seed that draws the numbers of pairs is `seed` plus this offset. Sources use `seed`, `seed + 1` and so on.
 _SIZES = 1_000_003
 
 
@@ -32,14 +31,15 @@ class MixedProblems:
     Args:
         sources: constructors of the sources, called with ``batch_size``, ``seed`` and ``options``. A constructor is
             :class:`SyntheticProblems` or a :func:`functools.partial` of this class.
-        shares: positive number for each source, proportional to the source's problems in a batch; equal when ``None``.
+        shares: one positive number per source. The number of problems of a source is proportional to its share.
+            ``None`` means equal shares.
         batch_size: number of problems per batch.
         seed: seed of the stream.
         options: further arguments of all constructors.
 
     Raises:
-        BaseError: when there are more or fewer shares than sources, or a share is not positive. ``batch`` raises the
-            same error when some sources know covariances and others do not.
+        BaseError: when the numbers of shares and sources differ, or a share is not positive. ``batch`` raises this
+            error when only some sources give covariances.
 
     Example:
         >>> from functools import partial
@@ -64,12 +64,12 @@ class MixedProblems:
         sizes = _split(batch_size, shares, round)
         parts = zip(sources, sizes, strict=True)
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
-        # Sources take turns in proportion to their shares, so that every slice of a batch has about these shares.
+        # The order interleaves the sources, so that every slice of a batch has approximately the same shares.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
 
     def batch(self, index: int) -> Problems:
-        """Draw batch ``index``, at least 0."""
+        """Draw a batch; the first index is 0."""
         count = len(self.sources)  # distinct indices, so that no two sources draw the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
@@ -97,7 +97,7 @@ def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], 
 
 
 def _joined(parts: list[Problems], name: str) -> Tensor | None:
-    """Concatenate sigmas or confidences, (B,) or (B, N), NaN for parts without them; ``None`` if no part has them."""
+    """Concatenate the field ``name`` of all parts. Missing fields are NaN; ``None`` if all parts lack the field."""
     known = [getattr(part, name) for part in parts]
     dimensions = max((value.ndim for value in known if value is not None), default=0)
     if not dimensions:
@@ -113,10 +113,11 @@ class MixedPoints:
 
     Args:
         priors: the priors.
-        shares: positive number for each prior, proportional to the prior's problems; equal when ``None``.
+        shares: one positive number per prior. The number of problems of a prior is proportional to its share. ``None``
+            means equal shares.
 
     Raises:
-        BaseError: when there are more or fewer shares than priors, or a share is not positive.
+        BaseError: when the numbers of shares and priors differ, or a share is not positive.
 
     Example:
         >>> from kornia_pnpnet.data import BoxPoints, SlabPoints, SyntheticProblems
@@ -131,7 +132,7 @@ class MixedPoints:
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """See :class:`PointPrior`."""
-        # A random offset gives each prior its share on average, also in small batches.
+        # A random offset before rounding gives each prior its share on average, also in small batches.
         offset = unit((), generator).item()
         sizes = _split(batch_size, self.shares, lambda bound: math.floor(bound + offset))
         drawn = [prior(size, n, generator) for prior, size in zip(self.priors, sizes, strict=True) if size]
@@ -140,12 +141,12 @@ class MixedPoints:
 
 @dataclass(eq=False)
 class VaryingSize:
-    """Batches with different numbers of pairs per problem and about the same total number of pairs.
+    """Batches that differ in the number of pairs per problem, but hardly in the total number of pairs.
 
-    Batches differ in shape, so worker processes cannot draw them (``data_workers=0`` in a training).
+    Worker processes cannot draw batches of different shapes, so training needs ``data_workers=0``.
 
     Args:
-        source: constructor of a source, with the arguments ``n``, ``batch_size`` and ``seed``.
+        source: constructor of a source, called with ``n``, ``batch_size`` and ``seed``.
         n: numbers of pairs per problem. Each batch draws one of these numbers.
         batch_size: number of problems in a batch with the smallest ``n``. Other batches have fewer problems.
         seed: seed of the stream.
@@ -174,7 +175,7 @@ class VaryingSize:
         self.sources = [self.source(n=n, batch_size=batch_size, seed=seed) for n, batch_size, seed in sizes]
 
     def batch(self, index: int) -> Problems:
-        """Draw batch ``index``, at least 0."""
+        """Draw a batch; the first index is 0."""
         generator = batch_generator(self.seed + _SIZES, index)
         turn = int(torch.randint(len(self.sources), (), generator=generator))
         return self.sources[turn].batch(index)

@@ -16,11 +16,11 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# Distance of a near outlier's pixel from the pixel of its point, in standard deviations of the pixel noise. `_NEAR` is
-# the range without `near_pixels`. `_LEAST_NEAR` is the smallest value of each end of the range `near_pixels`. A choice:
-# the noise itself hardly exceeds 5 standard deviations.
+# Distance between the pixel of a near outlier and the pixel of its point, in standard deviations of the pixel noise.
+# First, the range without `near_pixels`. Second, the smallest values of the two ends of `near_pixels`.
+# A choice: the noise itself hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
-# Pairs: added to n * max_ratio before rounding down, so that 0.33 in place of 1/3 gives floor(n / 3) for n up to 15.
+# This number is added to n * max_ratio before rounding down. With 0.33 the result is then floor(n / 3) for n up to 15.
 _SLACK = 0.05
 
 
@@ -40,30 +40,31 @@ class OutlierKind(IntEnum):
 class OutlierMix:
     r"""Number and kinds of the outliers of random problems.
 
-    The number of outliers is a uniform integer from a minimum to a maximum, and outliers have random indices. Kinds are
+    The number of outliers is a uniform integer between two bounds, and the outliers are random pairs. Kinds are
     assigned in the order structured, near, crowd, mismatch. Each share applies to the outliers that have no kind yet.
 
     Args:
-        max_ratio: largest number of outliers as a share of the pairs, rounded down. 0.33 gives n // 3 for n up to 15.
+        max_ratio: largest share of outliers. The largest count is rounded down: 0.33 gives n // 3 for n up to 15.
         count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
-        min_count: smallest number of outliers; the largest number replaces a ``min_count`` above it.
+        min_count: smallest number of outliers, limited to the largest number of outliers.
         min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
-        mismatch_share: probability that an outlier of no other kind is a *mismatch* (its pixel shows another point).
-            Otherwise it is a *sensing* outlier (its pixel is uniform in the image).
-        near_share: probability that an outlier is *near*: its pixel is close to the pixel of its point.
-        near_pixels: range, in pixels, of the distance between a near outlier and the pixel of its point, log-uniform.
-            The ends of the range are raised to at least 5 and 10 standard deviations of the pixel noise. ``None``: the
-            range is 5 to 50 standard deviations.
+        mismatch_share: probability that an outlier of no other kind is a *mismatch* and not a *sensing* outlier. The
+            pixel of a mismatch shows another point. The pixel of a sensing outlier is uniform in the image.
+        near_share: probability that an outlier is *near*. The pixel of a near outlier is close to the pixel of its
+            point.
+        near_pixels: range, in pixels, of the distance of a near outlier's pixel from the pixel of its point, drawn
+            log-uniform. The lower end is raised to at least 5 standard deviations of the pixel noise, and the upper end
+            to at least 10. ``None`` means 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
-        structured_ratio: range of the number of structured outliers relative to the number of inliers, uniform.
-        structured_angle: largest rotation in radians of the points that structured outliers show. These points are also
-            shifted.
-        mirrored_share: probability that a problem mirrors the points that structured outliers show.
-        crowd_share: probability that a problem has *crowds*: outliers with the pixels of a few pairs, the leaders. The
-            probability that an outlier joins a crowd is uniform from 0 to 1 and differs between problems.
-        max_crowds: largest number of leaders; the number is a uniform integer from 1.
-        point_crowd_share: probability that the crowds of a problem share world points of the leaders instead of pixels.
+        structured_ratio: range from which each problem draws its ratio of structured outliers to inliers uniformly.
+        structured_angle: largest rotation angle in radians. The pixels of structured outliers show a rotated and
+            shifted copy of the problem's points.
+        mirrored_share: probability that a problem also mirrors the copy of the points for its structured outliers.
+        crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
+            leader. Each problem draws the probability that an outlier joins a crowd uniformly from 0 to 1.
+        max_crowds: largest number of crowds. Each problem draws its number uniformly from 1 to ``max_crowds``.
+        point_crowd_share: probability that all crowds of a problem have the leaders' world points, not their pixels.
 
     Raises:
         BaseError: for a number or a range out of its bounds.
@@ -110,7 +111,7 @@ class OutlierMix:
         """Draw a value of :class:`OutlierKind` for each pair, int64, shape ``(batch_size, n)``.
 
         Raises:
-            BaseError: when ``n`` is smaller than the number of outliers.
+            BaseError: when ``count`` exceeds ``n``.
         """
         most = self.max_count(n)
         least = min(self.min_count, most) if self.count is None else most
@@ -121,7 +122,7 @@ class OutlierMix:
 
         count = torch.randint(least, most + 1, (batch_size, 1), generator=generator)
         rank = chance(n).argsort(-1).argsort(-1)
-        is_open = rank < count  # outliers that are not structured or near
+        is_open = rank < count  # outliers whose kind can still change
         kind = is_open * torch.where(chance(n) < self.mismatch_share, OutlierKind.MISMATCH, OutlierKind.SENSING)
         if self.structured_share:
             chosen = chance(1) < self.structured_share
@@ -141,7 +142,7 @@ class OutlierMix:
 
 
 def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: tuple[float, float] | None) -> Tensor:
-    """Draw offsets of near outliers in pixels, (B, n, 2); ``img_sigma`` is the pixel noise, (B, 1) or (B, n)."""
+    """Draw pixel offsets of near outliers, (B, n, 2). The shape of ``img_sigma`` is (B, 1) or (B, n)."""
     direction = normalize(normal((len(img_sigma), n, 2), generator), dim=-1)
     each, img_sigma = (len(img_sigma), n, 1), img_sigma[..., None]
     if pixels is None:
@@ -151,7 +152,7 @@ def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: 
 
 
 def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Generator) -> Tensor:
-    """Rotate all points about their centre, shift and mirror them (see :class:`OutlierMix`), (B, N, 3)."""
+    """Mirror, rotate and shift a copy of all points, (B, N, 3); see :class:`OutlierMix`."""
     batch_size = len(cam_points)
     centre = cam_points.mean(1, keepdim=True)
     size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]
@@ -159,7 +160,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
     if mix.structured_angle:
         turn = random_poses(batch_size, generator, max_angle=mix.structured_angle).rotation
     shift = 0.5 * size * normal((batch_size, 1, 3), generator)
-    if mix.mirrored_share:  # at a plane with a random normal
+    if mix.mirrored_share:  # mirror at a plane with a random normal
         axis = normalize(normal((batch_size, 3, 1), generator), dim=1)
         mirrored = unit((batch_size, 1, 1), generator) < mix.mirrored_share
         turn = torch.where(mirrored, turn - 2.0 * (turn @ axis) @ axis.mT, turn)

@@ -1,7 +1,8 @@
 """Priors of points in the camera's frame: the protocol's box, slabs, objects, façades, rooms, drives.
 
-A new prior is a class with the ``__call__`` of :class:`PointPrior`. Constructors take keyword arguments. An argument of
-two numbers is a range. Constructors raise ``BaseError`` for a number out of its bounds or a range that falls.
+A new prior is a class with the method ``__call__`` of :class:`PointPrior`. An argument of two numbers is a range.
+Constructors raise ``BaseError`` for a number out of its bounds, and for a range whose second number is smaller than the
+first.
 """
 
 from __future__ import annotations
@@ -21,28 +22,27 @@ __all__ = ["BoxPoints", "DrivePoints", "FacadePoints", "ObjectPoints", "PointPri
 
 Range: TypeAlias = tuple[float, float]
 
-# The numbers below are choices. They cover scenes from a flat picture on a wall to a street. Lengths are in metres.
-# Slabs: half-size of the window as a tangent; largest tangent of a direction; distance; standard deviation of the
-# slopes; thickness relative to the distance; smallest depth of the surface relative to the distance.
+# The numbers below are choices that cover scenes from a flat picture on a wall to a street. Lengths are in metres.
+# Slabs: half the size of the window as a tangent, largest tangent of a direction, distance.
 _SLAB_WINDOW, _SLAB_TANGENT, _SLAB_DISTANCE = (0.15, 0.8), 0.9, (10.0, 40.0)
+# Slabs: standard deviation of a slope, thickness / distance, smallest depth of the surface / distance.
 _TILT, _THICKNESS, _LEAST_SURFACE = 0.5, (0.02, 4.0), 0.3
-# Objects: distance relative to the object's half-size; largest tangent of the direction of the centre; smallest factor
-# of an axis; share of planar objects.
+# Objects: distance / half-size, largest tangent of the direction to the centre, smallest ratio of a shorter axis to the
+# longest axis, share of planar objects.
 _OBJECT_DISTANCE, _OBJECT_TANGENT, _THINNEST, _PLANAR = (1.5, 40.0), 0.8, 0.05, 0.15
-# Façades: distance; largest angle between normal and optical axis in degrees; relief relative to the depth; share of
-# problems with two façades.
+# Façades: distance, largest angle in degrees between the normal and the optical axis, relief / depth, share of problems
+# with two façades.
 _FACADE_DISTANCE, _SLANT, _RELIEF, _CORNER = (4.0, 60.0), 70.0, (0.001, 0.1), 0.3
-# Smallest ratio of a façade's distance along the optical axis to the depth of a point. The
-# depth is thus at most 20 times the distance, also on rays that miss the façade.
+# Smallest ratio of a façade's distance to the depth of a point. Rays that miss the façade also get this ratio.
 _LEAST_FACING = 0.05
-# Rooms: sides; height; number of pieces of furniture; smallest depth of furniture relative to the depth of the wall
-# behind. Closer furniture is left out, because nobody photographs the door of a cupboard.
+# Rooms: sides, height, number of pieces of furniture, smallest ratio of the depths of furniture and the wall behind.
+# Closer furniture would hide the room and is left out.
 _ROOM_SIDE, _ROOM_HEIGHT, _FURNITURE, _NEAREST = (2.0, 15.0), (2.2, 5.0), 4, 0.15
-# Drives: height of the camera; distance of the house fronts; distance of the end of the street; standard deviation of
-# the yaw in degrees; share of points on cars and trees; height of the street's ceiling, so large that no ray shows it.
+# Drives: height of the camera, distance of the house fronts, distance of the end of the street.
 _CAMERA_HEIGHT, _STREET_SIDE, _STREET_END = (1.0, 3.0), (2.5, 20.0), (30.0, 200.0)
+# Drives: standard deviation of the yaw in degrees, share of points on cars and trees, height of an invisible ceiling.
 _YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
-# Replaces smaller components of rays as divisors, so that a ray along a wall meets the wall far away, not at infinity.
+# Smallest divisor in `_hits`. A ray parallel to a wall then meets the wall far away and not at infinity.
 _PARALLEL = 1e-9
 # Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
@@ -83,7 +83,7 @@ class BoxPoints:
 
 
 class SlabPoints:
-    r"""Points as in photographs: a tilted slab of any thickness, seen through a window of the image.
+    r"""Points of a tilted slab of random thickness, seen through a window of the image.
 
     Thin slabs model façades and thick slabs model courtyards. Each problem draws a window with a centre :math:`c`, a
     distance :math:`d`, slopes :math:`g` and a thickness :math:`e`. Each point has a uniform direction
@@ -127,7 +127,7 @@ class ObjectPoints:
 
 
 class _View:
-    """Points on surfaces, seen through a random window of an image. Arguments: see :class:`FacadePoints`."""
+    """Points on surfaces, seen through a random window of an image. For the arguments see :class:`FacadePoints`."""
 
     def __init__(self, *, field_of_view: Range = (15.0, 120.0), window: Range = (0.1, 1.0)) -> None:
         check_ranges(field_of_view=field_of_view, window=window)
@@ -146,20 +146,20 @@ class _View:
         return rays * self._depth(rays, generator)[..., None]
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw the depths of points on rays, (B, n). Rays have a third coordinate of 1, (B, n, 3)."""
+        """Draw the depth of a point on each ray, (B, n). The third coordinate of ``rays``, (B, n, 3), is 1."""
         raise NotImplementedError
 
 
 class FacadePoints(_View):
     """Points of one façade, or of two façades that meet at a corner, with relief.
 
-    Each façade is a plane that is turned away from the camera by a random angle. Recesses and balconies are steps: each
-    point lies deeper by the relief with probability 1/2. The standard deviation of all depths about these two levels is
-    a tenth of the relief.
+    Each façade is a plane that is turned away from the camera by a random angle. A random half of the points lies
+    deeper by the relief, as in recesses. All depths also get normal noise with a tenth of the relief as the standard
+    deviation.
 
     Args:
-        field_of_view: range of the angle between opposite sides of the square image in degrees, uniform.
-        window: range of the share of the image's area in which the points lie, log-uniform.
+        field_of_view: range of the field of view of the square image in degrees, uniform.
+        window: range of the ratio of the window's area to the image's area, log-uniform. All points lie in the window.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -180,8 +180,8 @@ class FacadePoints(_View):
 class RoomPoints(_View):
     """Points of a room seen from inside: floor, ceiling, walls and pieces of furniture.
 
-    The room is a box. The camera has a random rotation and a random position that is not close to a wall. Pieces of
-    furniture are boxes that hide the walls behind them. Arguments: see :class:`FacadePoints`.
+    The room is a box. The camera has a random rotation and a random position that is not close to a wall. Each piece of
+    furniture is a box that hides the wall behind. For the arguments see :class:`FacadePoints`.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -189,10 +189,10 @@ class RoomPoints(_View):
         turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
         ground = log_uniform((batch_size, 1, 2), *_ROOM_SIDE, generator)
         size = torch.cat((ground, uniform((batch_size, 1, 1), *_ROOM_HEIGHT, generator)), -1)  # (B, 1, 3)
-        low = -size * uniform((batch_size, 1, 3), 0.15, 0.85, generator)  # from the camera, in the room's axes
+        low = -size * uniform((batch_size, 1, 3), 0.15, 0.85, generator)  # relative to the camera, in the room's axes
         in_room = rays @ turn.mT
         z = _hits(in_room, low, low + size)[1]
-        # Furniture stands on the floor. A piece around the camera has a negative `near` and is left out below.
+        # Furniture stands on the floor. A piece that contains the camera has a negative `near` and is left out below.
         shape = batch_size, _FURNITURE, 3
         extent = size * uniform(shape, 0.08, 0.4, generator)
         start = low + (size - extent) * unit(shape, generator)
@@ -206,8 +206,8 @@ class RoomPoints(_View):
 class DrivePoints(_View):
     """Points seen from a car: the road, the house fronts on both sides and the end of the street.
 
-    The camera looks approximately along the street. Points on cars and trees are closer than the surface behind them.
-    Arguments: see :class:`FacadePoints`.
+    The camera looks approximately along the street. Some points are closer than the surface behind, like points on cars
+    and trees. For the arguments see :class:`FacadePoints`.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -224,7 +224,7 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """The factors at which rays, (..., 3), enter and leave a box, (...). A ray misses the box if enter >= leave."""
+    """Multiples of ``rays``, (..., 3), where the rays enter and leave a box. If enter >= leave, a ray misses."""
     rays = torch.where(rays.abs() < _PARALLEL, _PARALLEL, rays)
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)

@@ -1,4 +1,4 @@
-"""Real scenes: the images of one scene with their poses, and random problems drawn from them.
+"""Real scenes: the images of a scene with their poses, and random problems from these images.
 
 Convention: ``x_cam = R x_world + t``. Pixels and camera matrices follow COLMAP: the centre of the top-left pixel is
 (0.5, 0.5). The tensors of a scene are in float64 on the CPU.
@@ -76,7 +76,7 @@ class Scene:
         name: the scene's name.
         views: the images that observe enough points, sorted by name.
         skipped: names of the images that were left out because they observe too few points.
-        metric: whether the unit of the scene is the metre and not arbitrary.
+        metric: whether the unit of the scene is the metre. Otherwise the unit is arbitrary.
     """
 
     name: str
@@ -94,14 +94,13 @@ class Scene:
 class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
-    Each problem consists of ``n`` random points of a random image and their pixels. A *mismatch* gets the pixel of a
-    spare point of the same image, and a *sensing* outlier gets a uniform pixel of the image. All other pairs that are
-    inliers of the scene are inliers of the problem. ``outliers=OutlierMix(count=2)`` is the protocol's real data with
-    outliers. Points and poses do not depend on ``outliers``, so that different numbers of outliers can be compared on
-    the same problems.
+    Each problem consists of ``n`` random points of a random image and their pixels. The pixel of a *mismatch* is the
+    pixel of a spare point of the same image. The pixel of a *sensing* outlier is uniform in the image. Every other pair
+    that is an inlier of its image is an inlier of the problem. ``outliers=OutlierMix(count=2)`` is the protocol's real
+    data with outliers. Points and poses do not depend on ``outliers``.
 
-    As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's prior, and the world is moved so that this
-    pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
+    As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
+    this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
 
     Args:
         scene: the scene. Images with fewer than ``n + num_spares`` points are not used.
@@ -146,7 +145,7 @@ class SceneProblems(RandomProblems):
         return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
 
     def _draw(self, generator: torch.Generator) -> Problems:
-        # Draws that depend on `outliers` come last, so that points and poses do not depend on `outliers`.
+        # Draws for `outliers` come last, so that points and poses do not depend on `outliers`.
         view = torch.randint(len(self.views), (self.batch_size,), generator=generator)
         rows = _choose(self._counts[view], self.n + self.num_spares, generator)
         rows += (self._counts.cumsum(0) - self._counts)[view, None]
@@ -166,13 +165,13 @@ class SceneProblems(RandomProblems):
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
-    """Draw k different integers below each of ``counts``, (B,), in random order, (B, k), by Floyd's algorithm."""
+    """For each of ``counts``, (B,), draw k different integers from 0 to count - 1 by Floyd's algorithm, (B, k)."""
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
-        last = counts - k + i  # `last` grows in each iteration, so that `last` was not chosen before
+        last = counts - k + i  # grows with i, so `last` was not chosen before
         candidate = (draws[:, i] * (last + 1)).long().minimum(last)
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)
-    # Floyd's algorithm draws a uniform set in an order that is not uniform, so each row is shuffled.
+    # Floyd's algorithm draws a uniform set, but its order is not uniform. Each row is therefore shuffled.
     return chosen.gather(1, unit((len(counts), k), generator).argsort(1))

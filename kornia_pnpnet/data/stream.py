@@ -16,12 +16,12 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
 
-# Batches that each worker draws in advance: enough work for the time of a validation.
+# Number of batches that each worker draws in advance. These batches last for the duration of a validation.
 _AHEAD = 4
 
 
 class ProblemSource(Protocol):
-    """A source of problems. Batch ``i`` always has the same numbers. Workers need batches of one shape."""
+    """A source of problems. Equal indices give equal batches. For workers, all batches must have the same shape."""
 
     batch_size: int
 
@@ -31,20 +31,18 @@ class ProblemSource(Protocol):
 
 
 def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 0) -> Generator[Problems, None, None]:
-    """Yield the batches from ``start`` to ``stop``, excluding ``stop``.
+    """Yield the batches ``start``, …, ``stop - 1``.
 
     The workers end when the iterator is exhausted, closed or deleted, and at the latest when the process ends. Workers
-    ignore Ctrl-C and the first SIGTERM, because these signals often reach a whole group of processes and the caller
-    decides when to stop.
+    ignore Ctrl-C and the first SIGTERM, so that the caller decides when to stop.
 
     Args:
-        source: the source of the problems. On platforms that spawn processes instead of forking them, the source must
-            be picklable and the main module must be safe to import.
+        source: the source of the problems. If the platform spawns processes instead of forking, the source must be
+            picklable and the main module must be safe to import.
         start: index of the first batch.
         stop: index after the last batch.
-        workers: number of processes that draw ahead; 0 draws each batch when it is requested. The problems do not
-            depend on the number of workers. With workers, a batch is valid until the next batch is requested; then its
-            memory is reused.
+        workers: number of worker processes. With 0, each batch is drawn on request. The problems do not depend on the
+            number of workers. With workers, a batch is valid only until the next batch is requested.
     """
     if workers == 0 or start >= stop:
         yield from map(source.batch, range(start, stop))
@@ -58,13 +56,13 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         num_workers=workers,
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
-        generator=torch.Generator(),  # keeps the loader from drawing from the caller's global generator
+        generator=torch.Generator(),  # else the loader would draw from PyTorch's global generator
         # In processes of joblib, the default start method is joblib's own. A loader cannot use this method.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
     indices: Any = iter(loader)
-    # A stream may be open until the interpreter exits. The workers must then end before the exit handler of
-    # multiprocessing runs: the handler sends one SIGTERM, which workers ignore, and waits for the workers.
+    # At exit, multiprocessing sends one SIGTERM to each worker and waits. Workers ignore the first SIGTERM, so this
+    # handler ends the workers first.
     atexit.register(indices._shutdown_workers)
     try:
         yield from map(slots.read, indices)
@@ -74,10 +72,10 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
 
 
 class _SharedSlots(Dataset[int]):
-    """Draws batch ``i`` into a slot of memory that all processes share, so that processes exchange only ``i``.
+    """Shared memory for batches. A worker writes batch ``i`` into a slot and sends only ``i``.
 
-    Sending the tensors instead would allocate shared memory for every batch, which takes about as long as drawing the
-    batch. There is one slot more than batches drawn in advance, so that the caller's batch is not overwritten.
+    Sending the tensors would be slower, because every batch would allocate shared memory. One slot holds the caller's
+    batch, and the other slots hold the batches drawn in advance.
     """
 
     def __init__(self, source: ProblemSource, example: Problems, slots: int) -> None:
@@ -94,6 +92,6 @@ class _SharedSlots(Dataset[int]):
 
 
 def _ignore_signals(_worker: int) -> None:
-    """Leave Ctrl-C and the first SIGTERM to the main process; a second SIGTERM ends the worker as usual."""
+    """Ignore Ctrl-C and the first SIGTERM. A second SIGTERM ends the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _frame: signal.signal(number, signal.SIG_DFL))

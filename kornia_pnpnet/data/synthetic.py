@@ -20,48 +20,47 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["SyntheticProblems"]
 
-#: A number, or a range (two numbers) from which each problem draws a number, log-uniform.
+#: A number, or a range: two numbers between which each problem draws a log-uniform number.
 Amount: TypeAlias = float | Sequence[float]
 
-# Smallest and largest value of each amount; every amount may also be 0. The bounds keep noise finite in float32.
+# Smallest and largest value of each amount. Every amount may also be 0. The bounds of `degrees` and `sigma_spread` keep
+# noise finite in float32.
 _AMOUNTS = {
     "img_sigma": (0.0, math.inf),
     "world_sigma": (0.0, math.inf),
     "degrees": (1.0, math.inf),
     "sigma_spread": (0.0, 3.0),
 }
-# Largest axis ratio: the shortest axis of a covariance stays above the rounding error of float32.
+# Largest axis ratio. Up to this ratio, float32 resolves the shortest axis of a covariance.
 _MOST_RATIO = 100.0
 # Largest pixel noise of an inlier with Student noise, in standard deviations. A choice.
 _MOST_NOISE = 10.0
-# Smallest squared length of noise, in squared standard deviations. The bound avoids 0 / 0 in Student noise; float64
-# resolves the quotient at the bound.
+# Smallest squared length of noise, in squared standard deviations. The bound avoids 0 / 0 in Student noise.
 _LEAST_SQ_LENGTH = 1e-12
-# Pixels: replaces a standard deviation of 0 as a divisor.
+# Smallest divisor in pixels: replaces a standard deviation of 0.
 _TINY = 1e-9
-# Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87 degrees.
+# Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87°.
 _LEAST_COSINE = 0.05
-# Half the side of the largest image without ``half_image``, at a focal length of 1: points beside the camera would
-# otherwise make the image huge.
+# Largest half side of an image at a focal length of 1, if `half_image` is `None`. Without this limit, points beside the
+# camera would make the image huge.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
-# Largest random term of a point's score in `_bunched`, in mean distances of points from the first point. A choice: the
-# bunches of problems range from sharp to hardly visible.
+# Largest blur in `_bunched`, relative to the mean distance. A choice: at a blur of 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
-# Choices for confidences. Ranges: distance between the mean scores of inliers and outliers in standard deviations,
-# decrease of an inlier's score with log(1 + noise), scale of the logits. Last, the standard deviation of the logits'
-# offset.
+# Choices for confidences. `_SEPARATION`: distance between the mean scores of inliers without noise and of outliers.
+# `_NOISINESS`: decrease of an inlier's score when log(1 + noise) grows by 1. `_GAIN`: factor from scores to logits.
+# `_OFFSET`: standard deviation of the offset of the logits.
 _SEPARATION, _NOISINESS, _GAIN, _OFFSET = (0.0, 4.0), (0.0, 1.0), (0.3, 3.0), 1.5
 
 
 @dataclass(kw_only=True, eq=False)
 class SyntheticProblems(RandomProblems):
-    r"""Random problems of the protocol, endless and reproducible: batch ``i`` depends on ``seed`` and ``i`` alone.
+    r"""Random, reproducible problems of the protocol: ``seed`` and ``i`` determine batch ``i``.
 
-    Points are drawn in the camera's frame, and the inverse of a random pose transforms them to the world frame. World
-    coordinates and pixels get noise, and some pairs become outliers. The defaults are the protocol's ``paper``
-    distribution without outliers. ``gaussian_pose`` is ``translation_sigma=25``, and ``fixed_mismatches`` is
-    ``outliers=OutlierMix(count=k, mismatch_share=1.0)``. A range is two numbers. Each problem draws a number from the
-    range, log-uniform.
+    Points are drawn in the camera's frame. The inverse of a random pose transforms the points to the world frame. World
+    coordinates and pixels get noise, and some pairs become outliers. The defaults are the protocol's distribution
+    ``paper`` without outliers. ``translation_sigma=25`` gives the distribution ``gaussian_pose``. The distribution
+    ``fixed_mismatches`` is ``outliers=OutlierMix(count=k, mismatch_share=1.0)``. A range is two numbers between which
+    each problem draws a log-uniform number.
 
     Args:
         n: number of pairs per problem.
@@ -69,32 +68,30 @@ class SyntheticProblems(RandomProblems):
         seed: seed of the stream.
         points: prior of the points in the camera's frame; ``BoxPoints()`` when ``None``.
         outliers: number and kinds of outliers; no outliers when ``None``.
-        translation_sigma: standard deviation of each coordinate of normally distributed translations. ``None``:
-            translations are uniform in a cube of side 25 about 0.
+        translation_sigma: standard deviation of each coordinate of normal translations. With ``None``, translations are
+            uniform in a cube of side 25 about 0.
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels; the principal point is 0.
-        half_image: pixels of *sensing* outliers are uniform in ``[-half_image, half_image]`` on both axes, in pixels.
-            ``None``: the square is the smallest one that contains the pixels of all points of the problem, with a field
-            of view of at most 120°.
+        half_image: half the side of the image in pixels. The pixels of *sensing* outliers are uniform in the image, a
+            square about 0. ``None`` means the smallest square that contains the pixels of all points of a problem, with
+            a field of view of at most 120°.
         img_sigma: standard deviation of the noise on each pixel coordinate in pixels, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
         degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range; 0 means Gaussian noise. With
-            Student noise, ``img_sigma`` is the scale of the distribution. A pair with pixel noise above
-            ``10 * img_sigma`` is then an outlier.
-        sigma_spread: standard deviation of the logarithm of the sigmas of pairs within a problem, at most 3, or a
-            range. Above 0, known sigmas have the shape ``(batch_size, n)``.
-        axis_ratio: ratio of the largest to the smallest standard deviation along the axes of the noise of a pixel or a
-            point, at most 100. The axes are random and differ between pairs; the standard deviations are a geometric
-            series. Above 1, ``img_sigma`` and ``world_sigma`` are the root mean square over the axes, and known noise
-            is given as covariances.
-        known_noise: share of the problems that come with both sigmas; 0 omits the sigmas of all problems. Above 0, a
-            third of the other problems come with one of the two sigmas, and unknown sigmas are NaN. With an
-            ``axis_ratio`` above 1, the share must be 0 or 1.
-        confidence_share: share of the problems that come with confidences, which are NaN in the other problems; 0 omits
-            the confidences of all problems. The separation of inliers from outliers and the scale of the logits differ
-            between problems.
-        bunched_share: share of the problems whose inliers are bunched in a part of the image, together with *near* and
-            *structured* outliers. The points of other outliers come from the rest of the scene.
+            Student noise, ``img_sigma`` is the scale of the distribution. Pairs with more pixel noise than
+            ``10 * img_sigma`` are then outliers.
+        sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. Above 0,
+            known sigmas have the shape ``(batch_size, n)``.
+        axis_ratio: ratio of the largest to the smallest standard deviation over the axes of a pair's noise, at most
+            100. Each pair has random axes. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the
+            axes, and known noise is given as covariances.
+        known_noise: share of the problems that have both sigmas. With 0, batches have no sigmas. Above 0, a third of
+            the other problems have one sigma, and missing sigmas are NaN. With an ``axis_ratio`` above 1, the share
+            must be 0 or 1.
+        confidence_share: share of the problems that have confidences; other problems have NaN. With 0, batches have no
+            confidences. The separation of inliers from outliers and the scale of the logits differ between problems.
+        bunched_share: share of the problems with a bunch. In these problems, inliers, *near* and *structured* outliers
+            lie in a part of the image. The points of other outliers come from the rest of the scene.
         dtype: dtype of the batches; numbers are drawn in float64.
         device: device of the batches; numbers are drawn on the CPU.
 
@@ -144,7 +141,7 @@ class SyntheticProblems(RandomProblems):
     def _draw(self, generator: torch.Generator) -> Problems:
         size, n, mix = self.batch_size, self.n, self.outliers or OutlierMix(count=0)
         pose = random_poses(size, generator, translation_sigma=self.translation_sigma, max_angle=self.max_angle)
-        # The scene has the N points of the pairs and N other points, which the pixels of mismatches show.
+        # The scene has 2N points: N points of the pairs, and N points for the pixels of mismatches.
         scene = (self.points or BoxPoints())(size, 2 * n, generator)
         kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
         in_crowd = (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
@@ -204,7 +201,7 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """Reorder points, (B, 2N, 3), so that pairs that are not ``displaced``, (B, N), form a bunch in the image."""
+        """Reorder points, (B, 2N, 3). Pairs that are not ``displaced``, (B, N), get the points of a bunch."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
         # The score of a point is the distance of its direction from the direction of the first point, plus blur.
@@ -214,19 +211,19 @@ class SyntheticProblems(RandomProblems):
         chosen = unit(each, generator) < self.bunched_share
         score = torch.where(chosen, score, unit(shape, generator))
         last = pad(displaced, (0, self.n), value=True)
-        # Pairs that are not displaced get the points of the lowest scores, in random order, so that the index of a pair
-        # is independent of its position in the image.
+        # Pairs that are not displaced get the points with the lowest scores. The order is random, so that a pair's
+        # index is independent of its pixel.
         rank = (last + unit(shape, generator)).argsort(1).argsort(1)
         return scene.take_along_dim(score.argsort(1).gather(1, rank)[..., None], 1)
 
     def _noise(
         self, shape: Sequence[int], sigma: Amount, degrees: Amount, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        r"""Draw noise (B, N, D); also return its standard deviations, (B, 1) or (B, N), and its covariances.
+        r"""Draw noise, (B, N, D), with its standard deviations, (B, 1) or (B, N), and its covariances, (B, N, D, D).
 
-        Covariances (B, N, D, D) are ``None`` when ``axis_ratio`` is 1. With :math:`\nu` degrees of freedom, the length
-        :math:`r` of normal noise, in standard deviations, is replaced by :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`. Noise
-        of two coordinates then has the bivariate Student distribution.
+        The covariances are ``None`` when ``axis_ratio`` is 1. For Student noise with :math:`\nu` degrees of freedom, a
+        length :math:`r` of standard normal noise becomes :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`. In two dimensions, the
+        result has the bivariate Student distribution.
         """
         noise = normal(shape, generator)
         sigmas = self._amounts(sigma, generator)
@@ -247,14 +244,14 @@ class SyntheticProblems(RandomProblems):
         return (factor @ noise[..., None])[..., 0], sigmas[..., 0], factor @ factor * sigmas[..., None].square()
 
     def _amounts(self, value: Amount, generator: torch.Generator) -> Tensor:
-        """Draw the amount of each problem, (B, 1, 1)."""
+        """Draw one number per problem, (B, 1, 1)."""
         each = self.batch_size, 1, 1
         if isinstance(value, Sequence):
             return log_uniform(each, value[0], value[1], generator)
         return torch.full(each, value, dtype=torch.float64)
 
     def _known_sigmas(self, img_sigma: Tensor, world_sigma: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """The sigmas that solvers get, NaN if unknown; see ``known_noise``."""
+        """Return the sigmas that are given to solvers; see ``known_noise``."""
         chance, side = unit((2, self.batch_size, 1), generator)
         has_one = chance < self.known_noise + (1.0 - self.known_noise) / 3.0
         known = {}
@@ -264,7 +261,7 @@ class SyntheticProblems(RandomProblems):
         return known
 
     def _confidence(self, inliers: Tensor, errors: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw confidences of a matcher, in (0, 1), NaN in problems without confidences, (B, N).
+        """Draw confidences, (B, N), in (0, 1) or NaN for problems without confidences.
 
         Inliers with more pixel noise have lower confidences. ``errors`` is the length of the pixel noise in standard
         deviations, (B, N).

@@ -1,6 +1,6 @@
 """Bounds: the accuracy that a solver could reach if it knew the inliers, or the inliers and the noise.
 
-A bound needs the true poses and inliers of the problems, so it cannot solve new problems.
+A bound needs the true poses and inliers of the problems, so a bound cannot solve new problems.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["KnownInliers", "KnownInliersAndNoise"]
 
-# Started from the true pose, the cost agrees with its minimum in 7 digits after 3 iterations, and in all digits of
-# float64 after 10 iterations.
+# From the true pose, the cost reaches its minimum to 7 digits in 3 iterations, and to all float64 digits in 10
+# iterations.
 _ITERATIONS = 10
 
 
 def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResult:
-    """Minimise the weighted squared reprojection errors, started from the true pose."""
+    """Minimise the weighted squared reprojection errors, starting from the true pose."""
     solver = PnPNet(None, RobustWeightedLM(_ITERATIONS, robustness=0.0, reject_worse=False))
     return solver(*problems[:3], weights, init=problems.pose, cam_from_rig=problems.cam_from_rig, **noise)
 
 
 class KnownInliers(Configured):
-    r"""Least squares of the reprojection errors of the true inliers, started from the true pose.
+    r"""Least squares of the reprojection errors of the true inliers, starting from the true pose.
 
-    A method that finds the inliers and then minimises their reprojection errors cannot expect a higher accuracy.
-    Source: the protocol's bound *known inliers*.
+    A method that must first find the inliers cannot expect a higher accuracy. Source: the protocol's bound *known
+    inliers*.
 
     Example:
         >>> from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -56,12 +56,12 @@ class KnownInliersAndNoise(Configured):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
     Noise in a world point moves the pixel of a close point more than the pixel of a distant point. The weight is
-    :math:`1 / (\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2)`, where :math:`J_x` is
-    the derivative of the pixel with respect to the point at the true pose. Source: the protocol's bound *known inliers
-    and noise*.
+    :math:`1 / (\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2)`. Here :math:`J_x` is
+    the Jacobian of the pixel with respect to the world point, at the true pose. Source: the protocol's bound *known
+    inliers and noise*.
 
     For problems with covariances the result is the maximum likelihood estimate from the inliers: the covariances whiten
-    the residuals. If only one of the two covariances is known, ``img_sigma`` or ``world_sigma`` replaces the other.
+    the residuals. If only one covariance is known, ``img_sigma`` or ``world_sigma`` replaces the unknown covariance.
 
     Args:
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
@@ -86,9 +86,9 @@ class KnownInliersAndNoise(Configured):
         known = {f"{kind}_cov": cov for kind, cov in covs.items() if cov is not None}
         return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **sigmas, **known)
 
-    @torch.no_grad()  # else the NaN gradient of a NaN point would reach all other points
+    @torch.no_grad()  # else the gradient of a NaN point would be NaN for all points
     def _inverse_variances(self, problems: Problems) -> Tensor:
-        """The weight of each pair in 1/px², 0 for an outlier, (B, N)."""
+        """The weight of each pair in 1/px², (B, N); 0 for outliers."""
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # the solver ignores points behind the camera

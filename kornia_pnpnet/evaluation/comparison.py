@@ -91,22 +91,22 @@ def evaluate(
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A pose that is not finite is replaced by the identity, and its ``ok`` by false. Errors are rounded to six
-    significant digits, and summaries are computed from the rounded errors.
+    A pose that is not finite is replaced by the identity, with ``ok`` false. Errors are rounded to six significant
+    digits, and summaries are computed from the rounded errors.
 
     With a ``path``, the results file is written after every row. A call with the same arguments, or with further
     solvers and data sets, continues the file. A file with rows of other code, versions, weights, configurations or
     problems is refused.
 
     Args:
-        solvers: solvers by name. Each is called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode
-            without gradients. A :class:`~kornia_pnpnet.solver.PnPNet` also gets
+        solvers: solvers by name. Each solver is called as ``solver(world_points, img_points, intrinsics)`` in
+            evaluation mode without gradients. A :class:`~kornia_pnpnet.solver.PnPNet` also gets
             :attr:`~kornia_pnpnet.result.Problems.known`. For bounds see :class:`SeesTruth`.
         data: sets of problems by name. Each set is solved on its own device and in its own dtype.
         path: the results file; ``None`` writes no file.
         overwrite: replace the file at ``path`` instead of continuing it.
         chunk: number of problems per call of a solver. A smaller number takes less memory.
-        repeats: smallest number of timed calls. One call on the first chunk precedes them and is not timed.
+        repeats: smallest number of timed calls. An untimed call on the first chunk precedes the timed calls.
         progress: show a progress bar; ``None`` shows it if standard error is a terminal.
 
     Returns:
@@ -117,15 +117,16 @@ def evaluate(
         - ``solvers``: class, configuration and digest of the weights of each solver,
         - ``data``: description, limits and digest of each set,
         - ``rows``: one row for each set and solver,
-        - ``left_out``: ``data``, ``solver`` and ``reason`` in place of a row, when a solver refuses the shape of a set
-          (a network for another n).
+        - ``left_out``: ``data``, ``solver`` and ``reason`` for each set whose shape a solver refuses (a network for
+          another n).
 
-        A row has ``success`` (rate, low, high, total), quartiles of ``rotation_error_deg`` and ``translation_error``,
-        the share ``ok``, ``us_per_problem`` (median of the timed calls), and errors and ok ``per_problem``. A row that
-        was measured on another machine also has ``environment``: the entries that differ from those of the file.
+        A row has ``success`` (rate, low, high, total), ``rotation_error_deg`` and ``translation_error`` (quartiles),
+        ``ok`` (share), ``us_per_problem`` (median of the timed calls), and ``per_problem`` (errors and ok of each
+        problem). A row from another machine also has ``environment``, with the entries that differ from the file's
+        ``environment``.
 
     Raises:
-        ValueError: when ``path`` is not a results file, or this evaluation cannot continue it.
+        ValueError: when ``path`` is not a results file, or holds another evaluation.
         OSError: when ``path`` cannot be written.
 
     Example:
@@ -152,7 +153,7 @@ def evaluate(
     results["left_out"] = []
     elsewhere = {key: here[key] for key in _MACHINE if results["environment"].get(key) != here[key]}
     if path is not None:
-        save_results(results, path)  # a path that cannot be written fails here, before the work
+        save_results(results, path)  # an error of writing appears here, before the work
 
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
@@ -187,7 +188,7 @@ def _describe_solver(solver: nn.Module) -> dict[str, Any]:
 
 def _describe_data(entry: EvaluationData) -> dict[str, Any]:
     problems = entry.problems
-    # The digest is of float32 numbers, because the last bits of float64 numbers differ between machines.
+    # The digest uses float32 numbers, because the last bits of float64 numbers differ between machines.
     rounded = problems.map(lambda part: part.float() if part.is_floating_point() else part)
     return {
         "description": dict(entry.description),
@@ -204,7 +205,7 @@ def _describe_data(entry: EvaluationData) -> dict[str, Any]:
 
 
 def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
-    """Solve a set and return the entries of its row, except the names of the set and the solver."""
+    """Solve a set and return its row without the names of the set and the solver."""
     was_training = solver.training
     solver.eval()
     try:
@@ -225,11 +226,11 @@ def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int)
 
 
 def _solve_all(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tuple[PoseErrors, Tensor, float]:
-    """Errors (float64) and ok of all problems on the CPU, and the median time per problem in seconds."""
+    """Return errors (float64) and ok of all problems, on the CPU, and the median seconds per problem."""
     chunks = [take(problems, slice(i, i + chunk)) for i in range(0, len(problems.world_points), chunk)]
     _solve(solver, chunks[0])
     calls = [_solve(solver, chunks[i % len(chunks)]) for i in range(max(repeats, len(chunks)))]
-    # A smaller last chunk is not timed, because the fixed cost of a call raises its time per problem.
+    # A smaller last chunk is not timed, because the fixed cost of a call would raise the time per problem.
     full = len(chunks[0].world_points)
     seconds = statistics.median(elapsed / full for result, elapsed in calls if len(result.ok) == full)
     found = [(result.pose, result.ok) for result, _ in calls[: len(chunks)]]

@@ -19,7 +19,7 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["BOUNDS", "default_solvers", "load_solver", "missing_package"]
 
-#: Bounds by name. A bound needs the true poses and inliers, so it cannot solve new problems.
+#: Bounds by name. A bound needs the true poses and inliers, so a bound cannot solve new problems.
 BOUNDS: dict[str, type[nn.Module]] = {"known-inliers": KnownInliers, "known-inliers-and-noise": KnownInliersAndNoise}
 
 # Competitors of the protocol, in the order of the protocol's figures.
@@ -28,15 +28,15 @@ _COMPETITORS = (
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Options of RANSAC for real scenes: the best threshold of a grid from 3 to 60 px, on problems of another seed from five
-# scenes with 0, 2 and 4 outliers in 9 pairs. Success hardly changes from 6 to 20 px.
+# Options of RANSAC for real scenes. The threshold is the best of a grid from 3 to 60 px. The grid used problems of
+# another seed from five scenes, with 0, 2 and 4 outliers in 9 pairs. Success hardly changes from 6 to 20 px.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
-# Options of RANSAC for synthetic data: the best thresholds of a grid from 3 px and 0.15 m to 8 px and 0.4 m, on
-# problems of another seed. Success changes by one percentage point over the grid.
+# Options of RANSAC for synthetic data. The thresholds are the best of a grid from (3 px, 0.15 m) to (8 px, 0.4 m), on
+# problems of another seed. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Module and name of each optional package, by the prefix of the solvers that need the package.
+# Optional packages by the start of solver names: module and name of the package.
 _PACKAGES = {
     "opencv-": ("cv2", "OpenCV"),
     "kornia-rs": ("kornia_rs", "kornia-rs"),

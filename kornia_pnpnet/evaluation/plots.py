@@ -32,7 +32,7 @@ __all__ = ["plot_errors", "plot_pose", "plot_success", "plot_training"]
 #: Colours that colour-blind readers can tell apart: the palette ``colorblind`` of seaborn.
 COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161", "#fbafe4", "#949494", "#ece133", "#56b4e9")
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-WIDTH = 7.2  #: inches; text width of a page with two columns, so that font sizes are those of the printed page
+WIDTH = 7.2  #: Inches. The text width of a page with two columns.
 #: Settings of matplotlib while a picture is drawn. ``text.parse_math`` is off: names of solvers are not formulas.
 THEME: Any = {
     **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "figure.titlesize"), 9.0),
@@ -45,7 +45,7 @@ themed = rc_context(THEME)  #: Decorator of functions that draw.
 
 
 def make_figure(width: float, height: float, *heading: str) -> Figure:
-    """Make a figure of a size in inches, with the lines of a title. The background is white, also for dark pages."""
+    """Make a white figure with a size in inches and a title of zero or more lines."""
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     if heading:
         figure.suptitle("\n".join(heading), x=0.01, ha="left")
@@ -61,12 +61,12 @@ def save(figure: Figure, path: str | Path) -> Path:
 
 @themed
 def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejected: Tensor, title: str) -> Path:
-    """Draw the pixels of an image, each joined to the reprojection of its point.
+    """Draw the pixels of an image, and a line from each pixel to the reprojection of its point.
 
     Args:
         path: the file to write.
         img_points: pixels, shape (N, 2). Pixels that are not finite are left out; ``ValueError`` if no pixel is finite.
-        reprojections: shape (N, 2), in pixels, not finite for points behind the camera.
+        reprojections: reprojected points in pixels, shape (N, 2), not finite for points behind the camera.
         rejected: whether a pair is rejected, bool, shape (N,).
         title: first part of the title.
     """
@@ -113,7 +113,7 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 @themed
 def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
-    """Draw the share of problems with an error of at most x; ``ValueError`` for results without per-problem errors."""
+    """Draw the cumulative distribution of the errors; ``ValueError`` for results without per-problem errors."""
     panels, colours = _panels(results)
     heading = "Problems with an error of at most x; the vertical line is the limit of a success"
     figure = make_figure(WIDTH, 1.2 + 2.2 * len(panels) + 0.05 * len(colours), heading)
@@ -134,7 +134,7 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 
 def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any]]], dict[str, str]]:
-    """The rows of each data set, and the colour of each solver; ``ValueError`` when there are no rows."""
+    """Group the rows by data set, and choose a colour for each solver; ``ValueError`` without rows."""
     panels: dict[str, list[Mapping[str, Any]]] = {}
     for row in results["rows"]:
         panels.setdefault(row["data"], []).append(row)
@@ -175,7 +175,7 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
 
 
 def log_scale(axes: Axes, name: str, formatter: Formatter | str = "{x:g}") -> None:
-    """Make the axis ``"x"`` or ``"y"`` logarithmic, with labels at powers of 10; short axes have more labels."""
+    """Make the axis ``"x"`` or ``"y"`` logarithmic, with labels at powers of 10 and, on short axes, in between."""
     axes.set(**{f"{name}scale": "log"})
     axis, (low, high) = getattr(axes, f"{name}axis"), getattr(axes, f"get_{name}lim")()
     axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))

@@ -1,4 +1,4 @@
-"""Sets of problems from the arguments that a user types: sources (synthetic data, scenes) and numbers of outliers."""
+"""Sets of problems for the command line, from sources (synthetic data, scenes) and numbers of outliers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["DEFAULT_SEED", "PRIORS", "evaluation_sets"]
 DEFAULT_SEED = 12345
 
 _slab = partial(SyntheticProblems, points=SlabPoints())
-#: Synthetic sources by name: their name in results files (a name of ``conf/data``), and their constructor.
+#: Synthetic sources by name. A value has the name in results files (a name of ``conf/data``) and the constructor.
 PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
     "synthetic": ("paper", SyntheticProblems),
     "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
@@ -77,14 +77,14 @@ def evaluation_sets(
         seed: seed of the problems.
         metric: whether the scenes are in metres.
         mismatches_only: make every outlier a mismatch; no two mismatches of a problem share a pixel. When false, about
-            half of the outliers are mismatches, and the others have random pixels.
+            half of the outliers are mismatches, and the other outliers have random pixels.
         known_noise: add the standard deviations of the noise to synthetic problems. Points and pixels do not change.
         dtype: dtype of the problems, which are drawn in float64 and then converted.
 
     Returns:
-        A set for each source, n and mix of outliers, by name. The description of a set has the keys ``source`` (name of
-        the prior or the scene), ``outliers`` (``"none"``, ``"uniform"`` or an integer), ``mismatch_share``, ``seed``
-        and, for a scene, ``path``.
+        Sets by name, one for each combination of source, n and outliers. The description of a set has the keys
+        ``source`` (name of the prior or the scene), ``outliers`` (``"none"``, ``"uniform"`` or an integer),
+        ``mismatch_share``, ``seed`` and, for a scene, ``path``.
 
     Raises:
         BaseError: when a source or a mix cannot be used.

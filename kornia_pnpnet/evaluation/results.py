@@ -30,10 +30,10 @@ _SHOWN_DIFFERENCES = 3
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
-    """Read the errors (float64) and ok (bool) of all problems from a row of ``results["rows"]``, each :math:`(B,)`.
+    """Read the errors (float64) and ``ok`` (bool) of all problems of a row, each :math:`(B,)`.
 
     Raises:
-        ValueError: when the row has no per-problem errors. The results files in the repository have no such errors.
+        ValueError: when the row has no per-problem errors. The repository's results files have only summaries.
     """
     if "per_problem" not in row:
         raise ValueError(f"The row of '{row['solver']}' on '{row['data']}' has no per-problem errors.")
@@ -43,7 +43,7 @@ def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
 
 
 def save_results(results: Mapping[str, Any], path: str | Path) -> None:
-    """Write results atomically as a JSON file: a reader finds the old file or the new file.
+    """Write results to a JSON file atomically: readers never find an incomplete file.
 
     Raises:
         ValueError: when a number is not finite, because JSON has no such numbers.
@@ -89,11 +89,11 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 
 
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Add the rows of the results file at ``path``, if the file exists, to a plan (results without rows).
+    """Fill ``plan``, which has no rows, with the rows of the file at ``path``. A missing file is ignored.
 
     Raises:
-        ValueError: when code or versions have changed, or a solver or data set of the file has changed or is missing in
-            the plan. The message names the first differences.
+        ValueError: when the plan does not continue the file. Code, versions, and the solvers and data sets of the file
+            must be equal in the plan. The message names the first differences.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh
@@ -116,7 +116,7 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
 def format_table(results: Mapping[str, Any]) -> str:
     """Format results as a Markdown table with aligned columns.
 
-    Each set and solver has one line: success with its 95 % interval, median errors, time and share of ok.
+    A line has the set, the solver, the success with its 95 % interval, median errors, time and share of ``ok``.
     """
     lines = []
     for row in results["rows"]:

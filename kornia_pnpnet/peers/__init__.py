@@ -1,6 +1,6 @@
 """Peers: solvers of other libraries with the call signature of PnPNet, for comparisons on the same problems.
 
-A library is imported when one of its solvers is constructed.
+The constructor of a solver imports the solver's library.
 """
 
 from kornia_pnpnet.peers.base import PeerPose, PeerSolver

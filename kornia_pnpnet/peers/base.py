@@ -32,8 +32,8 @@ class PeerPose(NamedTuple):
         rotation: world-to-camera rotation, shape :math:`(3, 3)`.
         translation: world-to-camera translation, shape :math:`(3,)`.
         inliers: whether the library reports a pair as an inlier, bool, shape :math:`(N,)`.
-        init: rotation and translation before the last refinement. ``None`` if the library does not report this pose;
-            the ``init`` of the result is then the final pose.
+        init: rotation and translation before the last refinement; ``None`` if the library does not report this pose.
+            With ``None``, ``PnPResult.init`` is the final pose.
     """
 
     rotation: np.ndarray
@@ -44,13 +44,13 @@ class PeerPose(NamedTuple):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class PeerSolver(nn.Module):
-    r"""A batched layer without gradients around a solver of another library, which solves one problem at a time.
+    r"""A batched layer around a solver of another library. The library solves one problem at a time.
 
-    A subclass implements :meth:`solve_one` and is a dataclass. Its fields are the arguments of its constructor. The
-    library gets the pairs that are present and have a weight above 0; the size of the weight has no effect. A problem
-    without a pose has ``ok=False``, and its pose is the identity. The library does not get problems with values that
-    are not finite, a negative weight, fewer than three pairs, a camera with skew, or a focal length that is not
-    positive.
+    A subclass is a dataclass that implements :meth:`solve_one`. The fields are the arguments of the constructor. The
+    library gets the pairs that are present and have a weight above 0, but not the weights. A problem without a pose has
+    ``ok=False``, and its pose is the identity. A problem is not solved if it
+    has fewer than three pairs, a negative weight or a value that is not finite. A problem is also not solved if its
+    camera has skew or a focal length that is not positive.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
@@ -73,7 +73,7 @@ class PeerSolver(nn.Module):
             self.library()
 
     def library(self) -> ModuleType:
-        """Import the library; the ``ImportError`` of a missing library names the extra to install."""
+        """Import the library, or raise an ``ImportError`` that names the extra to install."""
         assert self.source is not None
         module, name = self.source
         try:
@@ -117,10 +117,10 @@ class PeerSolver(nn.Module):
         ``ShapeError``.
 
         Returns:
-            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. Its dtype is
-            float64 when an input is float64, else float32. Weights are 1 for the inliers that the library reports, else
-            0. The cost is the mean squared reprojection error in px² of the pairs that the library gets; each squared
-            error is truncated at the squared threshold.
+            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. The dtype is
+            float64 if an input is float64, else float32. A weight is 1 if the library reports the pair as an inlier,
+            else 0. The cost in px² is the mean squared reprojection error of the pairs that the library gets. A squared
+            error above the squared threshold counts as the squared threshold.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
         if inputs.rig is not None:
@@ -175,7 +175,7 @@ class PeerSolver(nn.Module):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class RobustPeer(PeerSolver):
-    """A peer that draws random samples. For its arguments see ``OpenCVRansac``.
+    """A peer that draws random samples. For the arguments see ``OpenCVRansac``.
 
     Raises:
         BaseError: for a ``threshold``, ``confidence``, ``seed`` or number of iterations out of range.
@@ -196,7 +196,7 @@ class RobustPeer(PeerSolver):
 
 
 def _squared_errors(poses: Tensor, world: Tensor, img: Tensor, cameras: Tensor) -> Tensor:
-    """The squared reprojection errors in px², infinite for points behind the camera, (B, N)."""
+    """The squared reprojection errors in px², (B, N); infinite for points behind the camera."""
     cam_points = world @ poses[..., :3].mT + poses[:, None, :, 3]
     in_front = cam_points[..., 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ cameras.mT, eps=0.0)

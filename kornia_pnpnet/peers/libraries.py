@@ -17,7 +17,7 @@ __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PoseLib", "Py
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class _OpenCV(PeerSolver):
-    """A solver of OpenCV, whose constant has the name ``kind`` followed by ``method``."""
+    """A solver of OpenCV. The name of OpenCV's constant is ``kind`` followed by ``method``."""
 
     method: str
     kind: ClassVar[str] = "SOLVEPNP_"
@@ -64,22 +64,22 @@ class OpenCVPnP(_OpenCV):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class OpenCVRansac(_OpenCV, RobustPeer):
-    r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on its inliers, problem by problem.
+    r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on the inliers, problem by problem.
 
-    The defaults are the best of a grid on the protocol's data: 3000 problems of another seed without and with outliers,
-    a focal length of 3400 px, and thresholds from 30 to 120 px. In these data the noise of a close world point alone
-    moves its pixel by 17 px. World points with less noise need a lower threshold. With noisy world points,
-    ``method="SQPNP", refine=False`` solves more problems than the defaults, because SQPnP minimises an error in space
-    and not in the image. This choice takes several times as long as the defaults.
+    The defaults are the best of a grid with thresholds from 30 to 120 px. The grid used 3000 problems of the protocol
+    with another seed, without and with outliers. At the focal length of 3400 px, the noise of a close world point moves
+    the pixel by 17 px. World points with less noise need a lower threshold. With noisy world points, the options
+    ``method="SQPNP", refine=False`` solve more problems than the defaults, because SQPnP minimises an error in space
+    and not in the image. With these options, a problem takes several times as long as with the defaults.
 
     Args:
         threshold: largest reprojection error of an inlier in pixels.
         iterations: largest number of RANSAC iterations.
-        confidence: RANSAC stops when the probability of having drawn a sample without outliers reaches this number in
-            (0, 1).
+        confidence: number in (0, 1). RANSAC stops when the probability of at least one sample without outliers reaches
+            this number.
         method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
-        refine: minimise the squared reprojection error of the inliers, started from the pose of RANSAC. The ``init`` of
-            the result is the pose of RANSAC.
+        refine: refine the pose of RANSAC by least squares of the inliers' reprojection errors. ``PnPResult.init`` is
+            the pose of RANSAC.
         seed: seed of OpenCV's global random numbers, set before each problem.
 
     Example:
@@ -120,7 +120,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class OpenCVUsac(OpenCVRansac):
-    r"""OpenCV's ``solvePnPRansac`` in one of its USAC variants, problem by problem.
+    r"""A USAC variant of OpenCV's ``solvePnPRansac``, problem by problem.
 
     USAC has its own sampling, local optimisation and final refinement, so the pose is not refined again. For the other
     arguments see :class:`OpenCVRansac`.
@@ -128,8 +128,7 @@ class OpenCVUsac(OpenCVRansac):
     Args:
         method: OpenCV's name of the variant, for example ``"USAC_ACCURATE"`` or ``"USAC_MAGSAC"``. ``USAC_PROSAC``
             expects the pairs sorted from the best to the worst.
-        seed: seed of the local optimisation only. OpenCV draws the samples with a generator that it restarts for every
-            problem.
+        seed: seed of the local optimisation only. OpenCV restarts the generator of the samples for every problem.
     """
 
     method: str = "USAC_ACCURATE"
@@ -146,7 +145,7 @@ def _pinhole(intrinsics: np.ndarray) -> list[float]:
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
 
-    kornia-rs computes in float32. The class has no option for the local optimisation of kornia-rs, because it does not
+    kornia-rs computes in float32. There is no option for local optimisation, because local optimisation does not
     increase the number of solved problems on the protocol's data. For ``threshold``, its tuning, ``confidence`` and
     ``seed`` see :class:`OpenCVRansac`.
 
@@ -181,13 +180,12 @@ class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
     For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`. PoseLib's own default for
-    ``min_iterations`` is 1000; on problems of nine pairs it solves no more problems than the default of 100 here.
+    ``min_iterations`` is 1000. On problems of nine pairs, 1000 iterations solve no more problems than 100.
 
     Args:
         min_iterations: smallest number of RANSAC iterations.
         max_iterations: largest number of RANSAC iterations. A problem without a pose takes this number of iterations.
-        progressive_sampling: whether to use PROSAC, which samples from the first pairs first. The pairs must then be
-            sorted from the best to the worst.
+        progressive_sampling: use PROSAC, which needs pairs that are sorted from the best to the worst.
     """
 
     threshold: float = 40.0
@@ -220,9 +218,9 @@ class PoseLib(RobustPeer):
 class PyColmap(RobustPeer):
     r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
 
-    For ``threshold``, ``confidence`` and ``seed`` see :class:`OpenCVRansac`; ``threshold`` and ``loss_scale`` are tuned
-    on the grid described there. COLMAP's own default for ``loss_scale`` is 1 px, which suits world points with little
-    noise. With the noise of the protocol, 1 px solves several per cent fewer problems than the default here.
+    For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`. ``loss_scale`` is tuned on the
+    same grid. COLMAP's own default for ``loss_scale`` is 1 px, which suits world points with little noise. With the
+    noise of the protocol, 1 px solves several per cent fewer problems than 15 px.
 
     Args:
         loss_scale: scale of the Cauchy loss of the refinement in pixels.

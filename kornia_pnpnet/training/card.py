@@ -11,7 +11,7 @@ from kornia_pnpnet.training.results import RunResults
 __all__ = ["write_model_card"]
 
 _TAGS = ["camera-pose-estimation", "kornia", "perspective-n-point", "pnp"]
-# Overrides that change how a run is carried out but not its results.
+# Overrides that do not change the results of a run.
 _HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
 # Matches absolute paths, but not the slashes of a URL or of a relative path.
 _PATH = re.compile(r"(?:file://|(?<![\w./\\])(?:~|[A-Za-z]:)?)(?:/(?!/)|\\)[^\s,;'\"\]})]*")

@@ -1,4 +1,4 @@
-"""Means to stop, continue and watch a run: signals, checkpoints, learning curves and times of stages."""
+"""Stopping, continuing and watching a run: signals, checkpoints, learning curves and times of stages."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
 
 
 class StageClock:
-    """Wall-clock ``seconds`` of each stage of a loop. GPU work counts in the stage that waits for its result."""
+    """Wall-clock ``seconds`` of each stage of a loop. GPU work counts in the stage that waits for the GPU."""
 
     def __init__(self, *stages: str) -> None:
         self.seconds = dict.fromkeys(stages, 0.0)
@@ -111,7 +111,7 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
     Raises:
-        TrainingError: when the file is damaged, or when ``identity`` differs from the identity that the file holds.
+        TrainingError: when the file is damaged, or when ``identity`` differs from the identity in the file.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)

@@ -1,7 +1,7 @@
 """The training loop on one process or several. Lightning Fabric handles devices and processes.
 
-The loop ramps in the refined terms of the loss, and skips steps whose loss or gradient is not finite. A run that is
-stopped and continued gives the same numbers as a run without a stop.
+The loop raises the weight of the refined loss terms from 0 to 1, and skips steps whose loss or gradient is not finite.
+A run that is stopped and continued gives the same numbers as a run without a stop.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ _log = logging.getLogger(__name__)
 
 # Stages of an update. "rest" consists of learning curves, validations and checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
-# Columns that every row of the learning curves has.
+# Columns of the learning curves, except the columns of validations.
 _COLUMNS = (
     *("update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"),
     *(*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"),
 )
-# Columns of a validation without their prefix ``val/<set>/``, and the field of ValidationResult that each column shows.
+# Columns of a validation without the prefix ``val/<set>/``, and the attribute of ValidationResult in each column.
 _CURVES = {
     "success": "success.rate",
     "rotation_error_deg": "median_rotation_error_deg",
@@ -79,15 +79,16 @@ class TrainSettings:
         lr_refine: Adam's learning rate for the hyperparameters of the refinement.
         warmup: number of updates over which the learning rates rise linearly.
         final_lr: factor of the learning rates at the end of the cosine decay; 1 means no decay.
-        clip: norm to which longer gradients are scaled; infinity means no clipping.
-        ramp: two shares of the run, between which the weight of the refined loss terms rises linearly from 0 to 1.
+        clip: largest norm of a gradient. Longer gradients are scaled to this norm; infinity means no clipping.
+        ramp: start and end of the ramp, as shares of the run. During the ramp, the weight of the refined loss terms
+            rises linearly from 0 to 1.
         max_skipped: largest number of skipped steps. A larger number ends the run with an error.
         log_every: number of updates between rows of the learning curves.
         validate_every: number of updates between validations.
         checkpoint_every: number of updates between checkpoints.
 
     Raises:
-        BaseError: for a number out of range, or a ramp whose second share is smaller.
+        BaseError: for a number out of range, or a ramp that ends before its start.
     """
 
     updates: int
@@ -150,9 +151,9 @@ def fit(
         settings: numerical settings of the run.
         folder: folder of the run.
         fabric: a launched Fabric; one process on the CPU when ``None``.
-        identity: plain data that describe the run, for example the configuration of the data. A run can only be
-            continued with equal data.
-        data_workers: number of processes that draw batches for each training process, see
+        identity: plain data that describe the run, for example the configuration of the data. A run can be continued
+            only with an equal ``identity``.
+        data_workers: number of worker processes for each training process, see
             :func:`~kornia_pnpnet.data.stream.stream_batches`.
         resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
@@ -161,9 +162,9 @@ def fit(
         The report of this call.
 
     Raises:
-        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false; when the checkpoint is damaged or has
-            other settings, options of the solver or ``identity``; or when more than ``settings.max_skipped`` steps were
-            skipped.
+        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false; when the checkpoint is damaged or
+            belongs to another run; or when more than ``settings.max_skipped`` steps were skipped. Another run has other
+            settings, solver options or ``identity``.
         BaseError: when the batch size is not a multiple of the number of processes.
     """
     fabric = fabric or Fabric(accelerator="cpu", devices=1)
@@ -173,7 +174,7 @@ def fit(
     )
     checkpoint = Path(folder) / CHECKPOINT_NAME
     described = {"settings": asdict(settings), "model": model.config(), **(identity or {})}
-    described = json.loads(json.dumps(described))  # JSON turns tuples into lists, as in a checkpoint
+    described = json.loads(json.dumps(described))  # JSON turns tuples into lists
     start, skipped, state = 0, 0, None
     if checkpoint.exists():
         if not resume:
@@ -189,14 +190,14 @@ def fit(
     optimizer = torch.optim.Adam(groups, fused=True)
     solver, fabric_optimizer = fabric.setup(model, optimizer)
     solver.mark_forward_method("with_starts")
-    if state is not None:  # after the parameters are on their device, so that Adam's state follows them
+    if state is not None:  # after `setup`, so that Adam's state is on the device of the parameters
         optimizer.load_state_dict(state["optimizer"])
     model.train()
 
     validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
-    part = slice(fabric.global_rank, None, fabric.world_size)  # the processes share one batch
+    part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
     hidden = not (progress and fabric.is_global_zero)
     bar = tqdm(total=settings.updates, initial=start, disable=hidden, unit="update")
     batches = stream_batches(data, start, settings.updates, data_workers)
@@ -210,15 +211,15 @@ def fit(
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
             terms = _compare(solver, loss, problems, ramp)
-            # Before the ramp, a zero term keeps the refiner in the graph, because several processes need a gradient of
-            # every parameter.
+            # Before the ramp, the loss gets a zero term with the refiner's parameters, because training on several
+            # processes needs a gradient of every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")
             optimizer.zero_grad()
             fabric.backward(terms.total + 0.0 * unused)
             clock.lap("backward")
             norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
-            # All processes must take the same branch, even if only one process has a bad number or got the signal.
+            # All processes must take the same branch, even if only one process has a bad loss or got a signal.
             bad, stopped = _any_process(fabric, ~torch.isfinite(terms.total + norm), stop.is_set())
             if bad:
                 skipped += 1
@@ -300,7 +301,7 @@ def _report(
     skipped: int,
     interrupted: bool = False,
 ) -> FitReport:
-    """Report the work since the update ``start``; ``before`` are the clock's seconds at that update."""
+    """Report the work since the update ``start``. ``before`` holds the clock's seconds at the update ``start``."""
     clock.lap("rest")
     spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
     whole = max(sum(spent.values()), 1e-9)

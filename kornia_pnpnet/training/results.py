@@ -36,8 +36,8 @@ __all__ = [
 ]
 
 RESULTS_NAME = "results.json"
-# Problems per timed call, and number of timed calls. The result is the shortest time, because other work on the machine
-# only adds time.
+# Problems per timed call, and number of timed calls. The shortest time is reported, because other work on the
+# machine only adds time.
 _TIMED_PROBLEMS, _TIMED_CALLS = 1000, 20
 
 
@@ -48,7 +48,7 @@ class FitReport:
     Attributes:
         start: number of updates in earlier calls.
         update: number of updates in earlier calls and this call.
-        skipped: number of steps skipped in earlier calls and this call, because the loss or gradient was not finite.
+        skipped: number of skipped steps in earlier calls and this call. See :func:`~kornia_pnpnet.training.fit`.
         interrupted: whether a signal ended the call early. A checkpoint is then saved.
         seconds: wall-clock time of this call.
         updates_per_second: average speed of this call.
@@ -75,8 +75,8 @@ class FitReport:
 class ValidationResult:
     """Success (rotation error below 1°, translation error below 0.2) and errors on one validation set.
 
-    Fields with ``first_stage`` describe the initial poses, the other fields the refined poses. Translation errors are
-    in the unit of the world.
+    Fields with ``first_stage`` describe the initial poses. The other fields describe the refined poses. Translation
+    errors are in the unit of the world.
     """
 
     success: SuccessRate
@@ -88,14 +88,14 @@ class ValidationResult:
 
 
 class Learned(NamedTuple):
-    """Learned hyperparameters of the refinement, one number for each iteration."""
+    """Learned hyperparameters of the refinement. Each list has one number per iteration."""
 
     step: list[float]
     damping: list[float]
     robustness: list[float]
 
 
-# The keys that model cards and summaries read. The mappings have further keys.
+# The keys that model cards and summaries read. The mappings can have further keys.
 _Init = TypedDict("_Init", {"name": str})
 _Refine = TypedDict("_Refine", {"m": Count})
 _Size = TypedDict("_Size", {"n": Count})
@@ -123,7 +123,7 @@ class RunResults:
         origin: results of the run that trained the initial weights of this run; ``None`` for a run from scratch.
 
     Raises:
-        ValueError: when ``validation`` is empty, or when the number of hyperparameters does not fit the model.
+        ValueError: when ``validation`` is empty, or when a list of ``learned`` does not have one number per iteration.
     """
 
     __pydantic_config__: ClassVar = STRICT
@@ -157,13 +157,13 @@ class RunResults:
         return str(self.config.get("name") or self.initializer or "PnPNet")
 
     def lineage(self) -> list[RunResults]:
-        """The runs that led to these weights, the first run first and this run last."""
+        """The runs that trained these weights one after the other. The last entry is this run."""
         return [*(self.origin.lineage() if self.origin else ()), self]
 
 
 @torch.no_grad()
 def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, ValidationResult]:
-    """Solve the problems of each validation set and summarise the errors; sets are given and returned by name.
+    """Solve the problems of each validation set and summarise the errors by the name of the set.
 
     Raises:
         ValueError: when a set has no problems.
@@ -228,15 +228,15 @@ def find_results(weights: str | Path) -> RunResults | None:
         weights: name or folder of the weights, see :func:`~kornia_pnpnet.pretrained.find_weights`.
 
     Returns:
-        The results, or ``None`` without a results file. The file is looked for in the folder of the weights and, if the
-        name of this folder is ``weights``, in its parent folder.
+        The results, or ``None`` if there is no results file. The file is in the folder of the weights. If this folder
+        has the name ``weights``, the file can also be in the parent folder.
 
     Raises:
         FileNotFoundError: when the weights do not exist.
         ValueError: see :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Other folders may lie in the folder of another run.
+    # `train.py` writes weights into the folder `weights` of a run. Another folder can lie beside unrelated results.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
@@ -271,6 +271,6 @@ def summarize_runs(folder: str | Path) -> Path | None:
         rows.append(row)
     if not rows:
         return None
-    # Written atomically, because runs of a parallel launcher may write the summary at the same time.
+    # The file is written atomically, because parallel runs may write the summary at the same time.
     write_csv(folder / "summary.csv", dict.fromkeys(key for row in rows for key in row), rows)
     return folder / "summary.csv"
