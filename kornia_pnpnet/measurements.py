@@ -1,4 +1,4 @@
-"""Inputs of a solver with covariances: pixels from heat maps, and world points from depth."""
+"""Make pixels from heat maps and world points from depth, both with covariances, for a solver."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def heatmap_keypoints(
 
     The softmax of a map is a density that is constant in each cell. The mean of the density is Kornia's soft-argmax.
     The covariance of the density is the covariance of the cells' centres plus the variance of a cell, 1/12 per axis
-    (Sheppard's correction). The covariance is therefore positive definite even if all probability is in one cell. A
-    network can learn maps whose covariance is that of the keypoint's error, by a loss such as
-    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+    (Sheppard's correction). The covariance is therefore positive definite even if all probability is in one cell. With
+    a loss such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`, a network can learn maps whose covariance is
+    the covariance of the keypoint's error.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
@@ -46,8 +46,8 @@ def heatmap_keypoints(
         and ``img_cov`` of a solver. A map with NaN gives NaN, and its problem is then not ``ok``.
 
     Raises:
-        BaseError: when ``heatmaps`` does not have four dimensions or holds booleans or complex numbers, when
-            ``temperature`` is a number that is not positive, or when ``stride`` is not positive.
+        BaseError: when ``heatmaps`` is not a real tensor of four dimensions, or when ``temperature`` or ``stride`` is a
+            number that is not positive.
 
     Example:
         >>> heatmaps = torch.full((1, 1, 5, 5), -100.0)
@@ -90,8 +90,8 @@ def depth_points(
     A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
     :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
     exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the
-    derivative of :math:`r` by the pixel and :math:`\Sigma` is the covariance of the pixel. First-order propagation of
-    errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
+    derivative of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel. First-order
+    propagation of errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
 
     Args:
         img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`.
@@ -99,7 +99,7 @@ def depth_points(
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         depth_sigma: standard deviation of the depth in its unit: a number, :math:`(B,)` or :math:`(B, N)`.
-        img_sigma: see ``PnPNet.forward``. Pixels are exact without this and ``img_cov``.
+        img_sigma: see ``PnPNet.forward``. Pixels are exact if neither ``img_sigma`` nor ``img_cov`` is given.
         img_cov: see ``PnPNet.forward``.
 
     Returns:
