@@ -34,7 +34,7 @@ __all__ = [
 
 _T = TypeVar("_T")
 
-# Pairs. Parts have at least this number of pairs per problem, padding included, see `_without_padding`.
+# Pairs. `_without_padding` keeps at least this number of pairs of each problem, padding included.
 _LEAST_PAIRS = 16
 #: Keys: names of tensors in error messages. Values: whether the tensor has an entry for each pair (else one for each
 #: problem), and the shape of an entry. :func:`checked_inputs` has the shapes of the other tensors.

@@ -46,12 +46,12 @@ class Solve:
     r"""Map a table of problems to a table of poses, for example in ``map_batches`` of Ray Data.
 
     Each row is a problem. The number of pairs N may differ between rows. Each cell is a list of numbers in row-major
-    order:
+    order. The columns are
 
-    - ``world_points``: 3N numbers; ``img_points`` in pixels: 2N numbers.
-    - Optional: ``intrinsics``: 9 numbers; ``weights``: N numbers.
-    - Optional: ``img_sigma`` in pixels and ``world_sigma`` in the unit of the world: N numbers, or one number.
-      NaN means unknown.
+    - ``world_points`` (3N numbers) and ``img_points`` in pixels (2N numbers),
+    - optional ``intrinsics`` (9 numbers) and ``weights`` (N numbers),
+    - optional ``img_sigma`` in pixels and ``world_sigma`` in the unit of the world (N numbers or one number; NaN:
+      unknown).
 
     The result has the columns ``rotation`` (9 numbers), ``translation`` (3 numbers), ``weights`` (N numbers), ``cost``,
     ``ok`` and ``status``. A ``status`` is the name of a :class:`~kornia_pnpnet.result.Status` in lower case, or

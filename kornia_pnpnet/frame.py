@@ -2,7 +2,7 @@ r"""Normalisation of problems: the transform from the caller's frame to the solv
 
 Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0. Pairs can be sorted by
 their pixels, as in the paper. The world can be centred and scaled, so that the solved pose is equivariant to
-translations and scalings of the world. Every step can be undone exactly on a pose.
+translations and scalings of the world. A solved pose can be transformed back exactly.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Frame(NamedTuple):
         return Pose(pose.rotation, pose.translation / self.scale.view(-1, *more, 1) - offset)
 
     def undo_pairs(self, values: Tensor) -> Tensor:
-        """Reorder values of pairs, :math:`(B, N)`, from the normalised order to the caller's order."""
+        """Restore the caller's order of values of pairs, :math:`(B, N)`."""
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
     def undo_starts(self, starts: Starts) -> Starts:
@@ -230,7 +230,7 @@ class Normalize(Configured):
         usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # keep wide angles of few pairs
         is_usual, is_there = usual.to(rows.dtype), there.to(rows.dtype)
 
-        # Centre and scale of the usual points.
+        # Compute centre and scale from the usual points.
         share = is_usual.sum(0).clamp(min=1.0).reciprocal()
         usual_points = rows[:3] * is_usual
         mean = usual_points.sum(1) * share

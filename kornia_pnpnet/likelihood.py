@@ -32,7 +32,7 @@ __all__ = ["monte_carlo_pose_loss"]
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Radians. Upper limit of a component's rotation scale, because tangent vectors approximate larger rotations badly.
+# Radians. Upper limit of a t distribution's rotation scale. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
 # Number of iterations and damping of the refinement that finds a mode, see `_Posterior.mode`.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
@@ -68,13 +68,13 @@ def monte_carlo_pose_loss(
     distances between poses have no useful gradients. The likelihood compares the true pose with all other poses, and
     has a useful gradient from the first step.
 
-    The same number of samples is drawn from each component of a mixture. The components are the prior, a t distribution
-    around the true pose and around each hypothesis, and ``rounds`` further t distributions. Each further t distribution
-    is centred at a mode of the density. The sample with the largest importance weight so far is refined to this mode.
-    The precision of a t distribution is the matrix of the normal equations at its centre. In the prior :math:`p_0`,
-    rotations are uniform. Translations have a t distribution around the true translation. The scale of this
-    distribution is half the distance between camera and points. The prior has little effect once the correspondences
-    determine the pose.
+    The same number of samples is drawn from each component of a mixture. The components are the prior, one t
+    distribution around the true pose, one around each hypothesis, and ``rounds`` further t distributions. Each further
+    t distribution is centred at a mode of the density. The sample with the largest importance weight so far is refined
+    to this mode. The precision of a t distribution is the matrix of the normal equations at its centre. In the prior
+    :math:`p_0`, rotations are uniform. Translations have a t distribution around the true translation. The scale of
+    this distribution is half the distance between camera and points. The prior has little effect once the
+    correspondences determine the pose.
 
     Gradients flow to points, pixels, cameras, weights, sigmas and covariances, but not to poses. A problem that a
     solver would refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.

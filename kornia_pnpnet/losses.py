@@ -156,12 +156,12 @@ class SetLoss(nn.Module):
     The loss has no unit, because translation distances at the centroid of the points are divided by the distance of the
     centroid from the camera. The terms are:
 
-    - First guess: a weighted mean of the distance of the best hypothesis and of the mean distance of all hypotheses.
-      The best hypothesis has most of the weight, so that the network can propose different hypotheses.
+    - First guess: a weighted mean of the best hypothesis's distance and the mean distance of all hypotheses. The best
+      hypothesis has most of the weight, so that the network can propose different hypotheses.
     - Refined pose: the sum of both distances, each divided by its limit of success, and saturated as in
       :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
-    - Negative log-likelihood of the inliers' residuals at the true pose under the estimated noise.
+    - Negative log-likelihood of the estimated noise, given the inliers' residuals at the true pose.
 
     Args:
         starts: number of the network's hypotheses, which are the first poses of the starts.

@@ -42,8 +42,8 @@ def heatmap_keypoints(
         stride: image pixels per cell of the map. Cell 0 covers the first ``stride`` pixels.
 
     Returns:
-        The pixels, shape :math:`(B, N, 2)`, and their covariances in px², shape :math:`(B, N, 2, 2)`: ``img_points``
-        and ``img_cov`` of a solver. A map with NaN gives NaN, and its problem is then not ``ok``.
+        A solver's ``img_points``, shape :math:`(B, N, 2)`, and its ``img_cov`` in px², shape :math:`(B, N, 2, 2)`. A
+        map with NaN gives NaN, and the problem of the map is then not ``ok``.
 
     Raises:
         BaseError: when ``heatmaps`` is not a real tensor of four dimensions, or when ``temperature`` or ``stride`` is a
@@ -103,10 +103,10 @@ def depth_points(
         img_cov: see ``PnPNet.forward``.
 
     Returns:
-        The points, shape :math:`(B, N, 3)`, and their covariances in squared units of the world, shape
-        :math:`(B, N, 3, 3)`: ``world_points`` and ``world_cov`` of a solver. Both are NaN, without gradient, where the
-        depth is not positive, a pixel or a depth is not finite, or a sigma is negative. The problem of such a pair is
-        not ``ok`` unless the solver's ``mask`` excludes the pair.
+        A solver's ``world_points``, shape :math:`(B, N, 3)`, and its ``world_cov`` in squared units of the world, shape
+        :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its pixel or depth is not
+        finite, or its sigma is negative. The solver's ``mask`` must exclude such a pair, else its problem is not
+        ``ok``.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma

@@ -119,7 +119,7 @@ class Problem(NamedTuple):
         world_points: points of the (possibly centred and scaled) world, shape :math:`(B, N, 3)`.
         img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
             shape :math:`(B, N, 2)`.
-        weights: weight of each pair, at least 0; 0 means that the pair is padding, shape :math:`(B, N)`.
+        weights: weight of each pair, at least 0; 0 for padding, shape :math:`(B, N)`.
         focal: the focal length in pixels that all pairs share, a scalar.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
@@ -184,7 +184,7 @@ class Problem(NamedTuple):
     def seen_with(self, zoom: Tensor) -> Problem:
         """The same pairs with a known focal length: ``focal`` times the exponential of ``zoom``, (B, 1) or (B, 0).
 
-        Pixels and their noise are divided by the exponential, because all problems share ``focal``.
+        Pixels and their noise are divided by the exponential of ``zoom``, because all problems share ``focal``.
         """
         if not zoom.shape[1]:
             return self
@@ -224,7 +224,7 @@ class Starts(NamedTuple):
 
     @property
     def poses(self) -> list[Pose]:
-        """A list of ``pose`` and ``others``: rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)` each."""
+        """``pose`` and ``others`` in one list, each pose with the shapes :math:`(B, 3, 3)` and :math:`(B, 3)`."""
         others = () if self.others is None else map(Pose, *(x.unbind(1) for x in self.others))
         return [self.pose, *others]
 

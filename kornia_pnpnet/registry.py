@@ -37,7 +37,7 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
 
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """A solver that judges the pose of a method without refining the pose."""
+    """A solver that judges another method's pose without refinement."""
     refine = RobustWeightedLM(0, damping=1e-6, robustness=0.0, learnable=False)
     return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # only RANSAC depends on the order
 
@@ -96,11 +96,11 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     Args:
         name: one of :func:`list_solvers`.
         options: depend on the solver. Trained solvers and names with ``-lm`` take ``m``, the number of iterations (see
-            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). The solvers with EPnP, REPPnP and RANSAC
-            take the arguments of :class:`~kornia_pnpnet.propose.epnp.EPnP`,
-            :class:`~kornia_pnpnet.propose.reppnp.REPPnP` and :class:`~kornia_pnpnet.propose.ransac.RANSAC`. Solvers of
-            other libraries take the arguments of their class in :mod:`kornia_pnpnet.peers`. Solvers of this package
-            also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
+            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers that use
+            :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP` or
+            :class:`~kornia_pnpnet.propose.ransac.RANSAC` take the arguments of that class. Solvers of other libraries
+            take the arguments of their class in :mod:`kornia_pnpnet.peers`. Solvers of this package also take the
+            options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -159,9 +159,9 @@ def solve_pnp(
         fisheye: see ``PnPNet.forward``. Solvers of other libraries do not accept ``fisheye``.
 
     Returns:
-        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`. The dtype is float64 if any input is
-        float64, else float32. Gradients flow to points, pixels, intrinsics and weights. The matrix of a problem whose
-        ``ok`` is false is NaN without gradient. Such a problem raises no error and does not change other problems.
+        Matrices :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`. The dtype is float64 if any
+        input is float64, else float32. Gradients flow to points, pixels, intrinsics and weights. The matrix of a
+        problem whose ``ok`` is false is NaN without gradient. Such a problem raises no error.
 
     Raises:
         ValueCheckError: for an unknown name.

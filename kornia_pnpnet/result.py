@@ -95,7 +95,7 @@ class Pose(NamedTuple):
 
     @property
     def se3(self) -> Se3:
-        """The pose as Kornia's group element, with gradients. Kornia's tangent vectors are (translation, rotation)."""
+        """The pose as Kornia's ``Se3``, with gradients. Kornia's tangent vectors are (translation, rotation)."""
         return Se3.from_matrix(self.matrix)
 
     def camera(self, intrinsics: Tensor | PinholeCamera, height: int = 1, width: int = 1) -> PinholeCamera:
@@ -199,8 +199,7 @@ class Alternatives(NamedTuple):
     Attributes:
         rotation: world-to-camera rotations by ascending cost, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
-        cost: cost of each pose (see :class:`PnPResult`) in the refinement that compared the poses, shape
-            :math:`(B, S)`.
+        cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. The costs are comparable.
         probability: probability of each pose if the true pose is an alternative or the pose of the result, shape
             :math:`(B, S)`.
         valid: which slots hold a pose, bool, shape :math:`(B, S)`. Empty slots come last.

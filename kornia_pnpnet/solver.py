@@ -180,8 +180,8 @@ class PnPNet(PretrainedMixin):
             img_points: pixels, shape :math:`(B, N, 2)`; or bearings, shape :math:`(B, N, 3)`. Bearings are directions
                 of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras without their
-                extrinsics. In a rig, each pair may have a matrix, shape :math:`(B, N, 3, 3)`. Bearings may have
-                ``None``. Sigmas and thresholds of bearings are in radians without intrinsics, else in pixels at the
+                extrinsics. In a rig, each pair may have a matrix, shape :math:`(B, N, 3, 3)`. With bearings, ``None``
+                is allowed. Sigmas and thresholds of bearings are in radians without intrinsics, else in pixels at the
                 given focal length.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding are ignored.
@@ -193,16 +193,17 @@ class PnPNet(PretrainedMixin):
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
             img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape
-                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite. The refinement whitens the residuals.
+                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite.
             world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
                 :math:`(B, N, 3, 3)`.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. Pairs of high confidence are drawn more often for minimal samples.
-                Networks that were trained with confidences use them as an input. Confidences need not be calibrated.
+                Confidences are an input of networks that were trained with confidences. Confidences need not be
+                calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
-                of the refinement and of the choice among poses. The prior's pose is a start unless ``init`` is given.
-                ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the weight of the prior
-                is based on a standard deviation of one pixel.
+                of the refinement and of the choice of the best pose. The prior's pose is a start unless ``init`` is
+                given. ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the weight of the
+                prior is based on a standard deviation of one pixel.
             dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
@@ -213,7 +214,7 @@ class PnPNet(PretrainedMixin):
             first_stage_only: return the first guess without refinement (the paper's "Net"), as with ``m=0``.
             gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`; the option of the solver when ``None``.
             alternatives: largest number of alternative poses to return, see
-                :class:`~kornia_pnpnet.result.Alternatives`. Finding alternatives takes as long as several calls without
+                :class:`~kornia_pnpnet.result.Alternatives`. The search takes as long as several calls without
                 ``alternatives``.
 
         Returns:
