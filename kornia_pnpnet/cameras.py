@@ -204,7 +204,7 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
 
 
 def _angle(point: Tensor) -> tuple[Tensor, Tensor]:
-    """Lengths (B, N, 1) of points, 1 at the centre for finite gradients, and whether each point is central, bool."""
+    """Lengths (B, N, 1) of points, and whether each point is at the centre, bool. Central points get the length 1."""
     square = point.square().sum(-1, keepdim=True)
     is_central = square.detach() < torch.finfo(point.dtype).eps ** 2
     return torch.where(is_central, 1.0, square).sqrt(), is_central

@@ -43,7 +43,7 @@ class Frame(NamedTuple):
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         scale: factor of world lengths, shape :math:`(B,)`.
         img_scale: factor of pixels: the geometric mean of the factors of u and v, shape :math:`(B,)`. In a rig, the
-            mean over the pairs.
+            factor is the mean over the pairs.
         order: for each normalised pair, its position in the input, int64, shape :math:`(B, N)`. ``None``: the same
             order.
         status: ``Status.SOLVED`` for a valid problem, else the reason why the problem is invalid, int64, shape
@@ -79,7 +79,7 @@ class Frame(NamedTuple):
         return Pose(pose.rotation, pose.translation / self.scale.view(-1, *more, 1) - offset)
 
     def undo_pairs(self, values: Tensor) -> Tensor:
-        """Restore the caller's order of values of pairs, :math:`(B, N)`."""
+        """Sort values of pairs, :math:`(B, N)`, back to the caller's order."""
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
     def undo_starts(self, starts: Starts) -> Starts:
@@ -305,7 +305,7 @@ class Normalize(Configured):
 
 
 def _is_usable(noise: Noise, there: Tensor) -> Tensor:
-    """Whether all sigmas are NaN (unknown) or finite and not negative, and covariances are semi-definite, bool (B,)."""
+    """Whether each sigma is NaN or a finite number of at least 0, and each covariance is semi-definite, bool (B,)."""
     usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
     return torch.stack([*usable, *((are_semi_definite(x) | ~there.mT).all(-1) for x in noise.covariances)]).all(0)
 
@@ -330,5 +330,5 @@ def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Ten
     middle = ranked(points, (counts - 1) // 2).nan_to_num(posinf=0.0)
     sq_distance = (points - middle[:, None]).square().sum(0)
     typical = ranked(sq_distance[None], 2 * counts // 3)[0]
-    # If two thirds of the points coincide, the typical distance is infinite, and all points are usual.
+    # If two thirds of the points coincide, an infinite typical distance makes all points usual.
     return sq_distance, typical.masked_fill(typical == 0, torch.inf)

@@ -33,7 +33,7 @@ class LossTerms(NamedTuple):
         refined_rotation: chordal rotation distance after refinement.
         refined_translation: translation distance after refinement.
         weights: cross entropy of the weights as probabilities of being an inlier; 0 in :class:`PoseLoss`.
-        noise: negative log-likelihood of the inliers under the estimated noise; 0 in :class:`PoseLoss`.
+        noise: negative log-likelihood of the estimated noise; 0 in :class:`PoseLoss`.
     """
 
     total: Tensor
@@ -55,7 +55,8 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
             world's origin.
 
     Returns:
-        :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` and :math:`\|\hat t - t\|`, each :math:`(B,)`.
+        The rotation distance :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` for the angle :math:`\theta`, and the
+        translation distance :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
         BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.

@@ -89,16 +89,16 @@ def depth_points(
 
     A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
     :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
-    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the
-    derivative of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel. First-order
-    propagation of errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
+    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`. :math:`A` is the derivative
+    of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel. First-order propagation
+    of errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
 
     Args:
         img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`.
         depth: depth along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        depth_sigma: standard deviation of the depth in its unit: a number, :math:`(B,)` or :math:`(B, N)`.
+        depth_sigma: standard deviation of the depth in the unit of the world, a number, :math:`(B,)` or :math:`(B, N)`.
         img_sigma: see ``PnPNet.forward``. Pixels are exact if neither ``img_sigma`` nor ``img_cov`` is given.
         img_cov: see ``PnPNet.forward``.
 

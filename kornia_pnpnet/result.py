@@ -177,7 +177,7 @@ class Status(IntEnum):
 
     #: The problem is ``ok``.
     SOLVED = 0
-    #: Fewer than 3 pairs have a positive weight and a possible angle and distance, see ``Normalize``.
+    #: Fewer than 3 pairs have a positive weight and pass the tests of angle and distance in ``Normalize``.
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
@@ -232,7 +232,7 @@ class PnPResult(NamedTuple):
             ``intrinsics`` and ``dist`` are finite. These fields then have a gradient only with ``gradient="always"``.
         init: the first guess. The first guess of every valid problem has a gradient, even if the refinement failed, so
             that an initialiser can learn from failures.
-        status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`.
+        status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
         probability: estimated probability that the rotation error is at most 10 degrees, and the translation error at
             most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. If the noise is
             neither given nor estimated by the solver, the probability is computed from the residuals. Solvers of other

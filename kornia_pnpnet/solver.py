@@ -35,9 +35,9 @@ __all__ = ["PnPNet"]
 
 # Largest norm of the gradient of a problem's loss with respect to normalised inputs. Usual norms are about 1.
 _LONGEST_GRADIENT = 10.0
-# Additional iterations from a nominal focal length. Four is the least number that converges with 1000 pairs. With 2, 4
-# and 8 iterations the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322,
-# half outliers). Radial distortion gets its gradient from these iterations, because the search has no gradient.
+# Additional iterations from a nominal focal length. With 1000 pairs, fewer than four do not converge. With 2, 4 and 8
+# iterations the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half
+# outliers). Radial distortion gets its gradient from these iterations, because the search has no gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -79,7 +79,7 @@ class PnPNet(PretrainedMixin):
         init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to
             :class:`~kornia_pnpnet.problem.Starts`, see ``kornia_pnpnet.propose``. ``None``: the refinement starts from
             ``init`` or ``prior`` of the call, else from the identity.
-        refine: the refiner; classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM` when ``None``.
+        refine: the refiner. ``None``: a classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM`.
         normalize: the normalisation; the default centres and scales the world and sorts the pairs.
         effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples (see
             :func:`~kornia_pnpnet.propose.ransac.search_on`). A pose whose mirror image fits equally well is not ``ok``.
@@ -105,9 +105,8 @@ class PnPNet(PretrainedMixin):
             result's ``dist`` has the estimates.
 
     Raises:
-        BaseError: when an option is not one of its values or outside its range, when ``effort="adaptive"`` is given
-            without an initialiser that estimates the noise, or when ``focal_sigma`` or ``radial`` is given with a known
-            focal length.
+        BaseError: when an option has an invalid value, when ``effort="adaptive"`` is given without an initialiser that
+            estimates the noise, or when ``focal_sigma`` or ``radial`` is given with a known focal length.
 
     Example:
         >>> from kornia_pnpnet import MLPInit
@@ -184,7 +183,7 @@ class PnPNet(PretrainedMixin):
                 is allowed. Sigmas and thresholds of bearings are in radians without intrinsics, else in pixels at the
                 given focal length.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
-            mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding are ignored.
+            mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
                 of the initialiser. Without an initialiser the refinement starts from ``init`` alone.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
