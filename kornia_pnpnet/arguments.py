@@ -248,7 +248,7 @@ def _looking_along(inputs: Inputs) -> Inputs:
 
 
 def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:
-    """Merge the leading dimensions ``size`` into one batch dimension, and convert a tensor to ``dtype`` if not bool."""
+    """Merge the leading dimensions ``size`` into one batch dimension, and convert all but bool tensors to ``dtype``."""
     x = x if x.dtype in (dtype, torch.bool) else x.to(dtype)
     return x if len(size) == 1 else x.reshape((size.numel(), *x.shape[len(size) :]))
 

@@ -32,7 +32,7 @@ class LossTerms(NamedTuple):
         init_translation: translation distance of the first guess at the centroid of the points.
         refined_rotation: chordal rotation distance after refinement.
         refined_translation: translation distance after refinement.
-        weights: cross entropy of the weights as probabilities of being an inlier; 0 in :class:`PoseLoss`.
+        weights: cross entropy of the weights, which are inlier probabilities; 0 in :class:`PoseLoss`.
         noise: negative log-likelihood of the estimated noise; 0 in :class:`PoseLoss`.
     """
 

@@ -201,8 +201,8 @@ class PnPNet(PretrainedMixin):
                 calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
                 of the refinement and of the choice of the best pose. The prior's pose is a start unless ``init`` is
-                given. ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the weight of the
-                prior is based on a standard deviation of one pixel.
+                given. ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the refinement
+                with a prior assumes a standard deviation of one pixel.
             dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
