@@ -4,7 +4,7 @@ import lazy_loader
 
 __version__ = "0.1.0"
 
-# The public names are listed in __init__.pyi and imported at their first use. The command `pnpnet` can therefore print
-# its help, or report a missing file, without waiting for the import of PyTorch.
+# Public names (see __init__.pyi) are imported at their first use. The command `pnpnet` can therefore print its help, or
+# report a missing file, without waiting for the import of PyTorch.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ += ["__version__"]

@@ -1,4 +1,4 @@
-"""Checks of the arguments of a solver's call, and their conversion to one batch of one dtype."""
+"""Check the arguments of a solver's call, and convert them to one batch of one dtype."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ __all__ = [
 
 _T = TypeVar("_T")
 
-# Pairs. Least size of the pair dimension of a part, see `_without_padding`.
+# Pairs. `_without_padding` keeps at least this number of pairs of each problem, padding included.
 _LEAST_PAIRS = 16
-#: Shapes of tensors of a call by their names in error messages: whether the tensor has one entry for each pair (N) or
-#: one for each problem, and the shape of an entry. The shapes of cameras and lenses are in :func:`checked_inputs`.
+#: Keys: names of tensors in error messages. Values: whether the tensor has an entry for each pair (else one for each
+#: problem), and the shape of an entry. :func:`checked_inputs` has the shapes of the other tensors.
 _ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
     "weights": (True, ()),
     "mask": (True, ()),
@@ -56,12 +56,12 @@ _ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
 
 
 class Inputs(NamedTuple):
-    """The arguments of a call as one batch in one dtype. ``noise`` is ``None``, or has sigmas for every pair.
+    """The arguments of a call as one batch in one dtype. If ``noise`` is given, every pair has sigmas.
 
     In a rig, ``intrinsics`` has a camera matrix for each pair, (B, N, 3, 3), and ``rig`` has the transform from the rig
     to the camera of each pair. When a solver estimates the focal length, ``free_focal`` is the range and the prior of
-    the focal length in the caller's pixels. ``radial`` holds the estimated distortion coefficients by which the pixels
-    were undistorted.
+    the focal length in the caller's pixels. If ``radial`` is given, the pixels are already undistorted with these
+    estimated coefficients.
     """
 
     world_points: Tensor
@@ -83,9 +83,9 @@ class Part(NamedTuple):
 
     Attributes:
         inputs: the problems.
-        problems: positions of the problems in the batch, (P,); ``None``: the parts are consecutive slices of the batch.
-        pairs: positions of the part's pairs among the N pairs of each problem, (P, n); ``None``: all pairs in order.
-        most_pairs: number N of pairs of the batch; 0 without ``pairs``.
+        problems: positions of the problems in the batch, (P,). ``None``: the parts are consecutive slices of the batch.
+        pairs: for each problem, the positions of its pairs in the batch's pair dimension, (P, n). ``None``: all pairs.
+        most_pairs: size of the batch's pair dimension; 0 without ``pairs``.
     """
 
     inputs: Inputs
@@ -115,8 +115,8 @@ def checked_inputs(
     """Check the arguments of a call, and convert them to one batch of one dtype (``core.checks.common_dtype``).
 
     For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Distorted pixels
-    become pixels of pinhole cameras. Bearings become a rig in which each pair has a camera that looks along its
-    bearing. Values are not checked: reading values would stall a GPU, and one problem could fail the whole batch.
+    become pixels of pinhole cameras. Bearings become a rig: each pair gets a camera whose optical axis is the pair's
+    bearing. Tensor values are not checked, because reading a value would stall a GPU.
 
     Returns:
         The leading dimensions of ``world_points``, and the inputs with one batch dimension.
@@ -197,7 +197,7 @@ def checked_noise(
     img_cov: Tensor | None,
     world_cov: Tensor | None,
 ) -> Noise | None:
-    """The noise of every pair in the dtype of the points; ``None`` if neither sigmas nor covariances are given.
+    """The noise of every pair in the dtype of ``world_points``; ``None`` if the caller gave no sigma and no covariance.
 
     For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
     """
@@ -220,10 +220,10 @@ def checked_noise(
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
     """Replace distorted pixels by pixels of pinhole cameras, see :func:`~kornia_pnpnet.cameras.undistort`.
 
-    Pairs whose pixel cannot be undistorted are masked out, but non-finite pixels are kept: a solver refuses them.
+    Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay: ``Normalize`` refuses their problem.
     """
     broken = ~inputs.img_points.isfinite().all(-1)
-    # The identity replaces invalid cameras here, for finite gradients. `Normalize` refuses their problems later.
+    # The identity replaces invalid cameras, so that gradients are finite. `Normalize` later refuses these problems.
     diagonal = inputs.intrinsics.diagonal(dim1=-2, dim2=-1)
     usable = inputs.intrinsics.isfinite().flatten(-2).all(-1) & (diagonal / diagonal[..., 2:] > 0).all(-1)
     camera = torch.where(usable[..., None, None], inputs.intrinsics, torch.eye(3).to(diagonal))
@@ -234,7 +234,7 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 
 
 def _looking_along(inputs: Inputs) -> Inputs:
-    """Convert bearings to a rig: each pair gets a camera whose optical axis is the bearing of the pair."""
+    """Convert bearings to a rig, see :func:`checked_inputs`."""
     rotation, sound = bearing_cameras(inputs.img_points)
     axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
     # The geometric mean of fx and fy converts sigmas from pixels to radians. Skew and principal point are ignored.
@@ -248,36 +248,36 @@ def _looking_along(inputs: Inputs) -> Inputs:
 
 
 def one_batch(x: Tensor, size: torch.Size, dtype: torch.dtype) -> Tensor:
-    """Reshape the leading dimensions ``size`` to one batch dimension, and convert all but bool tensors to ``dtype``."""
+    """Merge the leading dimensions ``size`` into one batch dimension, and convert all but bool tensors to ``dtype``."""
     x = x if x.dtype in (dtype, torch.bool) else x.to(dtype)
     return x if len(size) == 1 else x.reshape((size.numel(), *x.shape[len(size) :]))
 
 
 def restore_leading(size: torch.Size, result: _T) -> _T:
-    """Reshape the batch dimension of a result to the leading dimensions that :func:`checked_inputs` returned."""
+    """Split the batch dimension of a result into the leading dimensions that :func:`checked_inputs` returned."""
     return result if len(size) == 1 else map_tensors(lambda x: x.reshape((*size, *x.shape[1:])), result)
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, world_points: Tensor, like: Tensor) -> Tensor:
-    """The camera matrices that the caller gave for a rig, one for each problem or pair, with a last entry of 1."""
+    """The caller's camera matrices of a rig, scaled to a last entry of 1: one matrix for each problem or each pair."""
     size = world_points.shape[:-2]
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = camera_matrices(intrinsics).to(like.dtype)
     matrices = matrices / matrices[..., 2:, 2:]
-    if isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3:  # Kornia's cameras are one batch
+    if isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3:  # one batch dimension
         return matrices.reshape(*size, 3, 3)
     return matrices.expand(*size, 3, 3) if matrices.ndim == 2 else matrices
 
 
 def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:
-    """Split a batch on a CPU into small parts that fit the CPU's caches and are solved one after the other.
+    """On a CPU, split a batch into parts that fit the caches and are solved one after the other.
 
     Args:
         inputs: the batch.
-        most: largest number of pairs of a part per thread. ``None``, or a call that records gradients: no limit.
-        any_number: whether problems may be grouped by their number of pairs, so that parts have little padding. A batch
-            of problems with few and with many pairs then takes a half to two thirds of the time.
+        most: largest number of pairs in a part per CPU thread. ``None`` or recorded gradients: no limit.
+        any_number: whether problems may be grouped by their number of pairs, so that parts have little padding.
+            Grouping saves a third to half of the time if the numbers of pairs differ strongly.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:
@@ -292,7 +292,7 @@ def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part
 
 
 def _without_padding(inputs: Inputs, most: int) -> list[Part]:
-    """Split a batch into parts of problems with similar numbers of pairs, at least two problems in each if possible."""
+    """Group problems with similar numbers of pairs into parts. Each part has at least two problems if possible."""
     assert inputs.mask is not None
     batch, count = inputs.mask.shape
     counts = inputs.mask.sum(1)

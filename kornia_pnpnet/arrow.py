@@ -1,4 +1,4 @@
-"""Solve tables of problems in the format of Apache Arrow, for Ray Data and other engines."""
+"""Solve tables of problems in Apache Arrow's format, for example from Ray Data."""
 
 from __future__ import annotations
 
@@ -33,36 +33,37 @@ INPUTS = tuple(_SHAPES)
 #: Columns that :class:`Solve` writes.
 OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
-# Type tests: whether a cell is a list, and whether a value is a number.
+# Tests of Arrow types. Each list type passes one test of `_LISTS`, each number type one test of `_NUMBERS`.
 _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
 _NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
-# Names of the values of Status, then the status of rows that were not solved.
+# Names of the values of `Status`, and last the status of rows that were not solved.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
-# Pairs. Problems with at least this number of pairs are padded, so that one call solves problems of similar size.
+# Pairs. Only problems with at least this number of pairs are padded, see `_groups`.
 _PADDED_FROM = 16
 
 
 class Solve:
     r"""Map a table of problems to a table of poses, for example in ``map_batches`` of Ray Data.
 
-    Each row is a problem. Each cell is one list of numbers in row-major order. The number of pairs N may differ between
-    rows. The columns are
+    Each row is a problem. The number of pairs N may differ between rows. Each cell is a list of numbers in row-major
+    order. The columns are
 
-    - ``world_points`` (3N numbers) and ``img_points`` (2N numbers, pixels),
-    - optionally ``intrinsics`` (9 numbers), ``weights`` (N numbers), and the standard deviations ``img_sigma`` in
-      pixels and ``world_sigma`` in the unit of the world (N numbers or one number; NaN: unknown).
+    - ``world_points`` (3N numbers) and ``img_points`` in pixels (2N numbers),
+    - optional ``intrinsics`` (9 numbers) and ``weights`` (N numbers),
+    - optional ``img_sigma`` in pixels and ``world_sigma`` in the unit of the world (N numbers or one number; NaN:
+      unknown).
 
-    The result has the columns ``rotation`` (9 numbers), ``translation`` (3), ``weights`` (N), ``cost``, ``ok`` and
-    ``status``, the name of a :class:`~kornia_pnpnet.result.Status` in lower case. Columns of the table with other
-    names, for example ``id``, are kept. Rows keep their order. Numbers are float32.
+    The result has the columns ``rotation`` (9 numbers), ``translation`` (3 numbers), ``weights`` (N numbers), ``cost``,
+    ``ok`` and ``status``. A ``status`` is the name of a :class:`~kornia_pnpnet.result.Status` in lower case, or
+    ``malformed``. Other columns of the table, for example ``id``, are kept. Rows keep their order. Numbers are float32.
 
-    A row that cannot be solved raises no error: its ``ok`` is false and its pose is the identity. Its status is
-    ``malformed`` when a list is missing or has an incorrect length, when the row has fewer than 3 pairs, or when the
-    solver was built for another number of pairs. The result of a row depends on the other rows only by rounding.
+    A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. A row is ``malformed`` if
+    a list is missing or has an incorrect length, or if the solver does not accept the number of pairs. Other rows
+    change the result of a row by rounding errors only.
 
     Args:
         solver: a name of :func:`~kornia_pnpnet.registry.list_solvers`, or a solver.
-        intrinsics: camera matrix for tables without ``intrinsics``, shape :math:`(3, 3)`.
+        intrinsics: camera matrix of all rows, for tables without the column ``intrinsics``, shape :math:`(3, 3)`.
         options: options of the named solver, see :func:`~kornia_pnpnet.registry.create_solver`.
 
     Raises:
@@ -78,7 +79,7 @@ class Solve:
         ([7, 8], [True, True])
     """
 
-    #: Approximate largest number of pairs, padding included, in one call of the solver, a limit of its memory.
+    #: Pairs. A call of the solver gets at most about this number of pairs (padding included), to limit the memory.
     pairs_at_once = 2**17
 
     def __init__(
@@ -106,7 +107,7 @@ class Solve:
         values: dict[str, np.ndarray] = {
             "rotation": np.tile(np.eye(3, dtype=np.float32), (len(counts), 1, 1)),
             "translation": np.zeros((len(counts), 3), dtype=np.float32),
-            "cost": np.full(len(counts), np.finfo(np.float32).max ** 0.5, dtype=np.float32),  # the cost without a pose
+            "cost": np.full(len(counts), np.finfo(np.float32).max ** 0.5, dtype=np.float32),  # see `PnPNet.forward`
             "ok": np.zeros(len(counts), dtype=bool),
             "status": np.full(len(counts), len(_STATUS_NAMES) - 1, dtype=np.int8),
         }
@@ -116,7 +117,7 @@ class Solve:
             there = np.arange(width) < counts[rows, None]  # (R, width), false for padding
             taken = {name: torch.from_numpy(x.take(rows, width)) for name, x in cells.items()}
             inputs: dict[str, Any] = {"intrinsics": self.intrinsics, **taken}
-            with torch.no_grad(), suppress(ShapeError):  # raised for another number of pairs
+            with torch.no_grad(), suppress(ShapeError):  # the solver does not accept this width
                 result = self.solver(**inputs, mask=None if there.all() else torch.from_numpy(there))
                 for name, array in values.items():
                     array[rows] = getattr(result, name).numpy()
@@ -129,7 +130,7 @@ class Solve:
 
 
 def list_column(values: np.ndarray) -> pa.Array:
-    r"""Make a column of lists from an array :math:`(B, …)`: one list of numbers in row-major order for each problem.
+    r"""Convert an array :math:`(B, …)` to a column of B lists of numbers in row-major order.
 
     Example:
         >>> list_column(np.eye(2)).to_pylist()
@@ -140,7 +141,7 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """The numbers of a column of lists. Row i has ``sizes[i]`` numbers in ``values``, from ``starts[i]`` on.
+    """A column of lists of numbers. The list of row i is ``values[starts[i] : starts[i] + sizes[i]]``.
 
     A missing number is NaN. A missing list has the size 0.
     """
@@ -173,8 +174,8 @@ class _Cells:
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
     """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
 
-    Rows with fewer than 16 pairs are not padded. Other rows are padded to the next of 16, 20, 24, 28, 32, 40, 48, ...,
-    at most a quarter more pairs. The padding of a row, and so its result, does not depend on other rows.
+    Rows with fewer than 16 pairs are not padded. Other rows are padded to the next number of the series 16, 20, 24, 28,
+    32, 40, 48, ..., which adds at most a quarter. The padding of a row does not depend on the other rows.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

@@ -1,4 +1,4 @@
-"""Cameras other than pinholes: distorted pixels become pixels of a pinhole camera, each bearing gets its own camera."""
+"""Convert distorted pixels to pixels of pinhole cameras or to bearings, and find a camera for each bearing."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ __all__ = ["bearing_cameras", "bearings", "check_coefficients", "pinholes", "und
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 # Newton steps from the distorted to the undistorted point.
 _STEPS = 12
-# Largest residual of a Newton solution on the plane z = 1, as a multiple of the square root of the machine epsilon.
+# Square roots of the machine epsilon. Newton solutions with a larger residual on the plane z = 1 are rejected.
 _LARGEST_RESIDUAL = 0.1
-# Radians (85 degrees). Fisheye pixels at a larger angle from the axis get no pixel of a pinhole camera.
+# Radians (85 degrees). Fisheye pixels at a larger angle from the axis are not undistorted.
 _WIDEST = 1.4835
 
 
@@ -32,9 +32,9 @@ def undistort(
     r"""Replace pixels of a camera with distortion by pixels of the pinhole camera with the same intrinsics.
 
     Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse.
-    :func:`kornia.geometry.calibration.undistort_points` is not used: its fixed-point iteration has no test of
-    convergence. For ``k1 = -0.2`` the result of its 5 steps is 1.4 px off at 45 degrees from the axis (focal length
-    320 px). Kornia also returns pixels beyond the turning point of the distortion polynomial, where no pixels exist.
+    Kornia's :func:`kornia.geometry.calibration.undistort_points` is not used, because its fixed-point iteration does
+    not test convergence. Kornia's error is 1.4 px for a pixel 45 degrees off the axis with ``k1 = -0.2`` and a focal
+    length of 320 px. Kornia also accepts pixels outside the range of the distortion polynomial.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.
@@ -44,11 +44,11 @@ def undistort(
         noise: noise of the distorted pixels.
 
     Returns:
-        The undistorted pixels; which pairs have an undistorted pixel, bool :math:`(B, N)`; the noise of the undistorted
-        pixels. A pixel cannot be undistorted beyond the turning point of the polynomial, more than 85 degrees off the
-        axis of a fisheye, or when pixel, coefficients or camera are not finite. The principal point then replaces the
-        pixel. Isotropic noise stays isotropic: its standard deviation is multiplied by the root mean square of the
-        singular values of the undistortion's Jacobian.
+        The undistorted pixels; whether each pixel could be undistorted, bool :math:`(B, N)`; and the noise of the
+        undistorted pixels. A pixel cannot be undistorted if it is outside the range of the polynomial, if it is more
+        than 85 degrees off the axis of a fisheye, or if the pixel, the coefficients or the camera are invalid. The
+        principal point then replaces the pixel. The standard deviation of isotropic noise is multiplied by the root
+        mean square of the singular values of the undistortion's Jacobian, so that the noise stays isotropic.
     """
     camera, _ = pinholes(intrinsics)
     point, found, lens = _through(dist, fisheye, img_points, intrinsics)
@@ -58,7 +58,7 @@ def undistort(
         point = torch.where(found[..., None], point, 0.0)
     pixels = transform_points(camera, flatten(point))
     if noise is not None:
-        with torch.no_grad():  # derivative of the undistorted point by the distorted point
+        with torch.no_grad():  # derivative of the undistorted with respect to the distorted point
             jacobian = _jacobian(flatten, point) @ _inverse(_jacobian(lens, point))
             jacobian = torch.where(found[..., None, None], jacobian, torch.eye(2).to(jacobian))
         to_pixels = camera[:, None, :2, :2]
@@ -125,14 +125,14 @@ def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
 
 
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Find rotations that turn each direction to the z axis, the optical axis of a camera.
+    r"""For each direction, find a rotation that maps the direction to the z axis (the optical axis).
 
     Args:
         rays: directions of any length but 0, shape :math:`(B, N, 3)`.
 
     Returns:
         Rotations :math:`(B, N, 3, 3)`, and which directions are valid (finite and not 0), bool :math:`(B, N)`. An
-        invalid direction has a constant rotation.
+        invalid direction gets a constant rotation.
 
     Example:
         >>> rotation, _ = bearing_cameras(torch.tensor([[[3.0, 0.0, -4.0]]]))
@@ -167,7 +167,7 @@ def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
 def _through(
     dist: Tensor | None, fisheye: Tensor | None, img_points: Tensor, intrinsics: Tensor
 ) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-    """Undistorted points (B, N, 2) of pixels, which pixels have such a point, bool (B, N), and the :func:`_lens`."""
+    """Undistorted points (B, N, 2), whether each pixel has an undistorted point, bool (B, N), and the :func:`_lens`."""
     camera, sound = pinholes(intrinsics)
     coefficients = fisheye if dist is None else dist
     if coefficients is not None:
@@ -182,10 +182,10 @@ def _through(
 
 
 def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor], Tensor]:
-    """A lens: a function from undistorted points (B, N, 2) to distorted points on the plane z = 1.
+    """Make the function that maps undistorted points (B, N, 2) to distorted points on the plane z = 1.
 
-    For ``dist``, undistorted points lie on the plane z = 1. For a fisheye, the length of an undistorted point is the
-    angle from the axis, which is finite at 90 degrees.
+    Without ``is_fisheye``, undistorted points also lie on the plane z = 1. With ``is_fisheye``, the length of an
+    undistorted point is its angle from the axis, because the plane z = 1 has no point at 90 degrees.
     """
     if coefficients is None:
         return lambda point: point
@@ -204,7 +204,7 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
 
 
 def _angle(point: Tensor) -> tuple[Tensor, Tensor]:
-    """Lengths (B, N, 1) of points with finite gradients (1 at the centre), and which points are at the centre, bool."""
+    """Lengths (B, N, 1) of points, and whether each point is at the centre, bool. Central points get the length 1."""
     square = point.square().sum(-1, keepdim=True)
     is_central = square.detach() < torch.finfo(point.dtype).eps ** 2
     return torch.where(is_central, 1.0, square).sqrt(), is_central
@@ -217,9 +217,9 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target`` (no solution: 0), and which targets have a solution."""
-    # A Newton step is at most about half as long as the target's distance from the centre. Two final steps carry the
-    # gradient to the target and to the coefficients. The second final step makes second derivatives exact.
+    """Find points (B, N, 2) that a lens maps to ``target`` (no solution: 0), and tell which targets have a solution."""
+    # The length of a Newton step is limited to half of the target's distance from the centre. Two further steps carry
+    # the gradients to the target and the coefficients. The second of these steps makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)
@@ -228,7 +228,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
             point = point + (step * (longest / step.norm(dim=-1, keepdim=True).clamp(min=longest))).nan_to_num(0.0)
         jacobian = _jacobian(lens, point)
         limit = _LARGEST_RESIDUAL * torch.finfo(point.dtype).eps ** 0.5 * (1.0 + target.norm(dim=-1))
-        # Beyond its turning point the polynomial has further solutions, at which it mirrors or rotates the image.
+        # Beyond its maximum the polynomial has further solutions, where the Jacobian mirrors or rotates the image.
         ahead = (torch.linalg.det(jacobian) > 0) & (jacobian.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
         found = ((target - lens(point)).norm(dim=-1) < limit) & ahead
         point = torch.where(found[..., None], point, 0.0)
@@ -241,7 +241,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
-    """Jacobians (B, N, 2, 2), by central differences, of a function that maps each point independently."""
+    """Central-difference Jacobians (B, N, 2, 2) of a function that maps each point independently."""
     # Newton's method converges to the same solution with approximate Jacobians.
     size = torch.finfo(point.dtype).eps ** (1 / 3)
     step = size * torch.eye(2, dtype=point.dtype, device=point.device)

@@ -20,8 +20,8 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["pose_covariance"]
 
-# Least eigenvalue of an information matrix scaled to a unit diagonal. A matrix with a smaller eigenvalue is singular up
-# to rounding in float64.
+# Least eigenvalue of a regular information matrix with a unit diagonal. Smaller eigenvalues are rounding errors of
+# float64.
 _LEAST_EIGENVALUE = 1e-13
 
 
@@ -42,17 +42,17 @@ def pose_covariance(
 ) -> Tensor:
     r"""First-order covariance of a pose found by weighted least squares.
 
-    The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the Jacobian of pixel
-    :math:`i` by the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`: if
-    :math:`(R, t)` is the true pose, the estimated pose is about :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-    :math:`\Sigma_i` is the covariance of the pixel, :func:`~kornia_pnpnet.refine.residual.pixel_covariance` (for
-    isotropic noise :func:`~kornia_pnpnet.refine.residual.pixel_variance`). The computation runs in float64. Gradients
-    flow to the pose, the points, the camera, the noise and the weights.
+    The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the derivative of pixel
+    :math:`i` with respect to the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`.
+    If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
+    :math:`\Sigma_i` is the covariance of the pixel's residual, see
+    :func:`~kornia_pnpnet.refine.residual.pixel_covariance` and, for isotropic noise,
+    :func:`~kornia_pnpnet.refine.residual.pixel_variance`. The computation runs in float64. Gradients flow to the pose,
+    the points, the camera, the noise and the weights.
 
-    A robust kernel gives most inliers a weight below 1, but an M-estimate is hardly less accurate than least squares on
-    the inliers (P. Huber, "Robust Statistics", 1981). Therefore :math:`w_i` is the ratio of the pair's weight to the
-    mean weight of an inlier, :math:`\bar w = \sum_i w_i^2 / \sum_i w_i`, clipped to at most 1. A common factor of the
-    weights has no effect.
+    A robust kernel gives most inliers a weight below 1. An M-estimate is nevertheless almost as accurate as least
+    squares on the inliers (P. Huber, "Robust Statistics", 1981). Let :math:`u_i` be the weight of pair :math:`i`. The
+    mean weight of an inlier is :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and :math:`w_i = \min(1, u_i / \bar u)`.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -60,26 +60,27 @@ def pose_covariance(
         img_points: pixels; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         img_sigma: see ``PnPNet.forward``; required without ``img_cov``.
-        world_sigma: see ``PnPNet.forward``. World points are exact without this and ``world_cov``.
+        world_sigma: see ``PnPNet.forward``. World points are exact if neither ``world_sigma`` nor ``world_cov`` is
+            given.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
-        weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as the ``weights`` of a result. The
-            weights of ``p3p-ransac`` with a ``world_threshold`` also depend on the depth; pass
-            ``(result.weights > 0).double()`` instead. ``None``: 1 for every pair.
+        weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as the ``weights`` of a result. For
+            ``p3p-ransac`` with a ``world_threshold`` pass ``(result.weights > 0).double()``, because the weights also
+            depend on the depth. ``None``: 1 for every pair.
         prior: the prior of the solver's call. Its information is added to the information of the pairs.
-        focal: ``"known"``; or ``"unknown"`` if the solver estimated the focal length. ``intrinsics`` must then be the
+        focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
             ``intrinsics`` of the result.
-        focal_sigma: ``focal_sigma`` of the solver. Its information is added to the information of the pairs.
+        focal_sigma: the solver's ``focal_sigma``. Its information is added to the information of the pairs.
 
     Returns:
-        Shape :math:`(B, 6, 6)` in radians and the unit of the world, in the dtype of a solver's result. With an unknown
-        focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the logarithm of the focal
-        length. If the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is infinite
-        and all other entries are 0.
+        Shape :math:`(B, 6, 6)` in radians and the unit of the world. The dtype is the dtype of a solver's result. With
+        an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the logarithm of
+        the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is
+        infinite and all other entries are 0.
 
     Raises:
-        BaseError: see ``PnPNet.forward``; also without the noise of the pixels, for another value of ``focal``, or for
-            ``focal_sigma`` with a known focal length.
+        BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` has another value,
+            or if ``focal_sigma`` is given with a known focal length.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -101,7 +102,7 @@ def pose_covariance(
         prior=prior,
     )
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
-    # The information matrix is well conditioned in the frame with the centroid 0 and the spread 1.
+    # The information matrix is well conditioned if the points have the centroid 0 and the spread 1.
     problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise)
     assert inputs.init is not None
     assert problem.noise is not None
@@ -141,7 +142,7 @@ def pose_covariance(
 
 
 def _inlier_probability(weights: Tensor) -> Tensor:
-    """Ratios of the weights to the mean weight of an inlier, clipped to at most 1, see :func:`pose_covariance`."""
+    """The factors :math:`w` in :func:`pose_covariance`, (B, N)."""
     total = weights.sum(-1, keepdim=True)
     mean = weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
     return (weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)

@@ -2,7 +2,7 @@ r"""Normalisation of problems: the transform from the caller's frame to the solv
 
 Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0. Pairs can be sorted by
 their pixels, as in the paper. The world can be centred and scaled, so that the solved pose is equivariant to
-translations and scalings of the world. Every step has an exact inverse on the pose.
+translations and scalings of the world. A solved pose can be transformed back exactly.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ __all__ = ["F_CONST", "Frame", "Normalize"]
 
 #: Pixels. Focal length of the normalised camera (cameras of ETH3D have focal lengths of 3400 to 3430).
 F_CONST = 3400.0
-# Typical distances (see `Normalize`). Points further than 5 typical distances from the median of the points do not
-# count for centre and scale. With fewer than 12 pairs the limit is 25, because few points give an inaccurate typical
-# distance.
+# Typical distances (see `Normalize`) from the median of the points. Centre and scale ignore points beyond `_FAR`. With
+# fewer than `_MANY` pairs the limit is `_FAR_OF_FEW`, because the typical distance of few points is inaccurate.
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
-# Typical distances from the median. Points further away lose their weight: float32 has too few digits for them.
+# Typical distances from the median. Points further away lose their weight, because float32 has too few digits.
 _LARGEST_DISTANCE = 1e6
-# Tangent of 85 degrees. A lens without distortion cannot show larger angles from the axis.
+# Tangent of 85 degrees. No real lens without distortion shows larger angles from the axis.
 _FAR_ANGLE = 11.4
 
 
@@ -43,12 +42,14 @@ class Frame(NamedTuple):
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         scale: factor of world lengths, shape :math:`(B,)`.
-        img_scale: factor of pixels, the geometric mean over both axes (in a rig its mean over the pairs), shape
+        img_scale: factor of pixels: the geometric mean of the factors of u and v, shape :math:`(B,)`. In a rig, the
+            factor is the mean over the pairs.
+        order: for each normalised pair, its position in the input, int64, shape :math:`(B, N)`. ``None``: the same
+            order.
+        status: ``Status.SOLVED`` for a valid problem, else the reason why the problem is invalid, int64, shape
             :math:`(B,)`.
-        order: position in the input of each normalised pair, int64, shape :math:`(B, N)`; ``None``: unchanged.
-        status: ``Status.SOLVED`` for a valid problem, else why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
-            :math:`(B, N, 3, 3)`. The identity replaces matrices that are no pinhole cameras.
+            :math:`(B, N, 3, 3)`. The identity replaces invalid matrices.
     """
 
     centroid: Tensor
@@ -64,7 +65,7 @@ class Frame(NamedTuple):
         return self.status == Status.SOLVED.value
 
     def apply(self, pose: Pose) -> Pose:
-        r"""Express a pose of the caller's world in the frame of the problem: :math:`(R,\; s (t + R c))`."""
+        r"""Express a pose in the frame of the problem: :math:`(R,\; s (t + R c))` with scale s and centroid c."""
         offset = (pose.rotation * self.centroid[:, None]).sum(-1)
         return Pose(pose.rotation, (pose.translation + offset) * self.scale[:, None])
 
@@ -78,7 +79,7 @@ class Frame(NamedTuple):
         return Pose(pose.rotation, pose.translation / self.scale.view(-1, *more, 1) - offset)
 
     def undo_pairs(self, values: Tensor) -> Tensor:
-        """Reorder values of pairs, :math:`(B, N)`, from the normalised order to the caller's order."""
+        """Sort values of pairs, :math:`(B, N)`, back to the caller's order."""
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
     def undo_starts(self, starts: Starts) -> Starts:
@@ -102,21 +103,21 @@ class Frame(NamedTuple):
 class Normalize(Configured):
     r"""Normalise the cameras, the order of the pairs, and the world frame of problems.
 
-    A problem is *valid* when its numbers are finite, its weights are not negative, at least three pairs have a weight,
-    its camera is a pinhole camera (any multiple of a camera matrix, with or without skew), and its points do not
-    coincide or lie on one line. The inputs of invalid problems are replaced by zeros, so that all later values and
-    gradients are finite. A pair of weight 0 is padding, and its other numbers are ignored.
+    A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
+    with or without skew). At least three of its pairs have a positive weight, and its points do not coincide or lie on
+    one line. The inputs of invalid problems are replaced by zeros, so that all later values and gradients are finite. A
+    pair of weight 0 is padding. The coordinates of padding are ignored.
 
     Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
     the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
-    five typical distances from the median of the points (25 with fewer than 12 pairs). Two thirds of the points are
-    within one typical distance of the median. A pair loses its weight when its point is more than a million typical
-    distances from the median, or when its pixel is almost 90° off the axis.
+    five typical distances from the median of the points (25 with fewer than 12 pairs). The typical distance is the
+    radius around the median that contains two thirds of the points. A pair loses its weight when its point is more than
+    a million typical distances from the median, or when its pixel is almost 90° off the axis.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
-        order: sort the pairs by their horizontal pixel coordinate, and ties by their vertical pixel coordinate (the
-            paper's input order). Pairs that are not usual, and padding, come last.
+        order: sort the pairs by u, and pairs with equal u by v (the paper's input order). Unusual pairs and padding
+            come last.
         center: move the centroid of the world points to the origin.
         scale: scale the world so that the root mean square distance of the usual points from the origin is 1.
 
@@ -169,8 +170,8 @@ class Normalize(Configured):
             rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
 
         Returns:
-            The normalised problem, with the batch as the last dimension in memory, and the :class:`Frame` that undoes
-            the normalisation.
+            The normalised problem, and the :class:`Frame` that undoes the normalisation. In memory, the batch is the
+            last dimension of the problem.
         """
         batch, count = world_points.shape[:2]
         padded = weights is not None or mask is not None
@@ -187,15 +188,14 @@ class Normalize(Configured):
         cameras, is_camera = _pinhole((cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)).contiguous())
         camera = cameras[:, None] if intrinsics.ndim == 3 else cameras  # (9, 1 or N, B)
 
-        # Make inputs safe before computing with them: fourth powers of numbers between this limit and its inverse
-        # neither overflow nor underflow. NaN compares false.
+        # Fourth powers of numbers between `limit` and its inverse neither overflow nor underflow. NaN compares false.
         limit = torch.finfo(rows.dtype).max ** 0.25
         there = rows[5] != 0
         sizes = rows.detach().abs()
         if padded:
             sizes = torch.where(there, sizes, zero)
         size = sizes[:5].amax(0)  # largest coordinate of each pair
-        # A sum, because a maximum in ONNX Runtime ignores NaN.
+        # The sum is tested, because the maximum of ONNX Runtime ignores NaN.
         is_finite = sizes.sum((0, 1)) < torch.inf
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
@@ -219,7 +219,7 @@ class Normalize(Configured):
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
         img_scales = focal / camera[:5:4]  # (2, 1 or N, B)
 
-        # A pair at an impossible angle or distance is an outlier: it loses its weight, but the problem stays valid.
+        # A pair at an impossible angle or distance loses its weight, but its problem stays valid.
         pixels = (rows[3:5] - camera[2:6:3]) * img_scales
         tangent = pixels.detach().abs().amax(0) / self.f_const
         sq_distance, typical = _distances(rows[:3].detach(), there, padded)
@@ -227,10 +227,10 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, _FAR_OF_FEW**2, _FAR**2) * typical
         seen = there & (tangent <= _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # of few pairs, wide angles count
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # keep wide angles of few pairs
         is_usual, is_there = usual.to(rows.dtype), there.to(rows.dtype)
 
-        # Centre and scale by the usual pairs.
+        # Compute centre and scale from the usual points.
         share = is_usual.sum(0).clamp(min=1.0).reciprocal()
         usual_points = rows[:3] * is_usual
         mean = usual_points.sum(1) * share
@@ -249,7 +249,7 @@ class Normalize(Configured):
         ):
             status = torch.where(fine, status, otherwise.value)
         valid = status == Status.SOLVED.value
-        # Pairs that lost their weight get the skew 0: their pixels can be so large that the product would overflow.
+        # Pairs without weight get the skew 0, because the product with their large pixels could overflow.
         without_skew = torch.addcmul(pixels[:1], camera[1] / camera[0] * is_there, pixels[1:], value=-1)
         world = (rows[:3] - centroid[:, None]) * scale
         # An invalid problem becomes zeros, without gradient.
@@ -272,8 +272,7 @@ class Normalize(Configured):
             mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
         frame = Frame(centroid.mT, scale, mean_scale, order, status, matrices)
         if noise is not None:
-            # Sigmas that are unknown (NaN) or impossible are replaced before the multiplication: otherwise the gradient
-            # of the scale would be NaN.
+            # Unknown (NaN) and impossible sigmas are replaced first, so that the gradient of the scale is not NaN.
             known = [has_noise[:, None] & ~sigma.isnan() for sigma in noise[:2]]
             scaled = [
                 torch.where(is_known, torch.where(is_known, sigma, 0.0) * unit, torch.nan)
@@ -295,7 +294,7 @@ class Normalize(Configured):
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 
     def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], scale: Tensor) -> Noise:
-        """Covariances in the units of the problem, raised above rounding; 0 for pairs that are not ``sound``."""
+        """Convert covariances to the units of the problem. Covariances of pairs that are not ``sound`` are ignored."""
         # `pixel_map` holds the entries a, b, d of the matrix [[a, b], [0, d]] that multiplies pixels.
         img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), (noise.img_cov, noise.world_cov))
         if img_cov is not None:
@@ -306,17 +305,17 @@ class Normalize(Configured):
 
 
 def _is_usable(noise: Noise, there: Tensor) -> Tensor:
-    """Whether all sigmas (NaN: unknown), and the covariances of pairs that are ``there``, are possible, bool (B,)."""
+    """Whether each sigma is NaN or a finite number of at least 0, and each covariance is semi-definite, bool (B,)."""
     usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
     return torch.stack([*usable, *((are_semi_definite(x) | ~there.mT).all(-1) for x in noise.covariances)]).all(0)
 
 
 def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, B) to a last entry of 1, and tell which are pinhole cameras; others become all ones."""
+    """Scale camera matrices (9, B) to a last entry of 1, and tell which are valid. Invalid matrices become all ones."""
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
     scaled = entries / entries[8:]
-    # A sum of absolute values below the limit bounds each term. NaN compares false.
+    # The sum of absolute values bounds each value. NaN compares false.
     largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].rsqrt())).abs().sum(0)
     below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
     fine = (largest < limit) & ~below_diagonal
@@ -331,5 +330,5 @@ def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Ten
     middle = ranked(points, (counts - 1) // 2).nan_to_num(posinf=0.0)
     sq_distance = (points - middle[:, None]).square().sum(0)
     typical = ranked(sq_distance[None], 2 * counts // 3)[0]
-    # When two thirds of the points coincide, no distance is typical.
+    # If two thirds of the points coincide, an infinite typical distance makes all points usual.
     return sq_distance, typical.masked_fill(typical == 0, torch.inf)

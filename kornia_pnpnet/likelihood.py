@@ -27,16 +27,16 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
 
-# Degrees of freedom of the t distributions. Their tails are heavier than the tails of the likelihood, so that no sample
-# has a very large importance weight.
+# Degrees of freedom of the t distributions. The tails of the t distributions are heavier than the tails of the
+# likelihood, so that no importance weight is very large.
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Radians. Upper limit of the scale of a component's rotations: tangent vectors approximate larger rotations badly.
+# Radians. Upper limit of a t distribution's rotation scale. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
-# Iterations, and their damping, of the refinement from the sample with the largest importance weight to a mode.
+# Number of iterations and damping of the refinement that finds a mode, see `_Posterior.mode`.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth, as a share of the distance between camera and points. A point with a smaller depth is projected from the
+# Least depth of a projection, as a share of the distance between camera and points. A smaller depth is raised to the
 # least depth, and the difference between both depths counts as a residual.
 _LEAST_DEPTH = 0.02
 
@@ -62,25 +62,26 @@ def monte_carlo_pose_loss(
     r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
 
     The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted
-    sum of the robust losses of the pairs; residuals are measured in standard deviations. If the world points have
+    sum of the robust losses of the pairs. Residuals are measured in standard deviations. If the world points have
     noise, the cost includes the logarithm of the variance, which then depends on the pose. :math:`Z` is an integral
-    over all poses, estimated by importance sampling. While the correspondences do not fit any pose, a distance between
-    poses has no useful gradient. This loss has a useful gradient from the first training step, because it compares the
-    true pose with all other poses.
+    over all poses, estimated by importance sampling. Early in a training no pose fits the correspondences, and
+    distances between poses have no useful gradients. The likelihood compares the true pose with all other poses, and
+    has a useful gradient from the first step.
 
-    Equal numbers of samples are drawn from each component of a mixture: the prior, t distributions around the true pose
-    and around each hypothesis, and ``rounds`` further t distributions. Each further t distribution is centred at a mode
-    of the density. To find the mode, the sample with the largest importance weight so far is refined. The precision of
-    a t distribution is the matrix of the normal equations at its centre. In the prior :math:`p_0`, rotations are
-    uniform, and translations have a t distribution around the true translation with a scale of half the distance
-    between camera and points. The prior has little effect once the correspondences determine the pose.
+    The same number of samples is drawn from each component of a mixture. The components are the prior, one t
+    distribution around the true pose, one around each hypothesis, and ``rounds`` further t distributions. Each further
+    t distribution is centred at a mode of the density. The sample with the largest importance weight so far is refined
+    to this mode. The precision of a t distribution is the matrix of the normal equations at its centre. In the prior
+    :math:`p_0`, rotations are uniform. Translations have a t distribution around the true translation. The scale of
+    this distribution is half the distance between camera and points. The prior has little effect once the
+    correspondences determine the pose.
 
     Gradients flow to points, pixels, cameras, weights, sigmas and covariances, but not to poses. A problem that a
     solver would refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
-    4 to 7. Differences from the paper: several hypotheses, a prior, and modes found by refinement in place of fitted
-    proposals.
+    4 to 7. Unlike the paper, this function uses several hypotheses and a prior, and refines samples to modes instead of
+    fitting proposals.
 
     Args:
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -92,20 +93,21 @@ def monte_carlo_pose_loss(
         mask: see ``PnPNet.forward``.
         img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network that predicts ``img_sigma`` can be
             trained with this loss.
-        world_sigma: see ``PnPNet.forward``. World points are exact without this and ``world_cov``.
+        world_sigma: see ``PnPNet.forward``. World points are exact if neither ``world_sigma`` nor ``world_cov`` is
+            given.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
         samples: number of poses drawn per problem, rounded down to a multiple of the number of components.
-        rounds: number of t distributions that are added one after the other.
+        rounds: number of t distributions around modes.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
-        scale: scale of the kernel in standard deviations; the exponent of ``"power"``.
+        scale: scale of the kernel in standard deviations. For ``"power"``, the exponent.
 
     Returns:
-        The loss of each problem, shape :math:`(B,)`, in nats, for a density per radian³ and world unit³.
+        The loss of each problem in nats, shape :math:`(B,)`. The density is per radian³ and world unit³.
 
     Raises:
         BaseError: see ``PnPNet.forward``; also for an unknown kernel, a scale that is not positive, fewer samples than
-            components, or without the noise of the pixels.
+            components, or missing noise of the pixels.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -140,7 +142,7 @@ def monte_carlo_pose_loss(
     assert noise is not None
     known = (noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()).all(1)
     img, world = (torch.where(known[:, None], x, 1.0) for x in noise[:2])
-    with torch.no_grad():  # the frame is a constant: its gradient would only add noise to the integral's gradient
+    with torch.no_grad():  # a gradient of the frame would only add noise to the integral's gradient
         _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
     unit = frame.scale[:, None]
     world_noise = None if noise.world_cov is None else noise.world_cov.scaled(unit.square())
@@ -207,7 +209,7 @@ class _Component(NamedTuple):
     def log_density(self, poses: Pose) -> Tensor:
         """Logarithm of the density per radian³ and unit³, (S, B)."""
         turn = poses.rotation @ self.pose.rotation.mT
-        # The inverse of Cayley's map. The denominator is clamped, because it is 0 for a half turn.
+        # The inverse of Cayley's map. The clamp avoids a division by 0 at a half turn.
         cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
         omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
         tangent = torch.cat((omega, poses.translation - self.pose.translation), -1)
@@ -227,7 +229,7 @@ class _Posterior(NamedTuple):
     noisy_points: bool  # whether world points have noise, so that the variance of a pixel depends on the pose
 
     def log_density(self, poses: Pose) -> Tensor:
-        """Logarithm of likelihood times prior, (S, B), of rotations (S, B, 3, 3) and translations (S, B, 3)."""
+        """Logarithm of likelihood times prior, (S, B). The poses have the shapes (S, B, 3, 3) and (S, B, 3)."""
         problem, noise, distance = self.problem, self.problem.noise, self.prior.distance
         assert noise is not None
         cam = problem.world_points @ poses.rotation.mT + poses.translation[..., None, :]  # (S, B, N, 3)
@@ -253,7 +255,7 @@ class _Posterior(NamedTuple):
         return self.prior.log_density(poses) - 0.5 * (problem.weights * loss).sum(-1)
 
     def component(self, pose: Pose) -> _Component:
-        """The t distribution around a pose with the precision of the normal equations, and with a bounded width."""
+        """Make the t distribution around a pose from the normal equations, and bound its width."""
         problem, projection = self.problem, project(State.of(pose), self.problem)
         sq_residual, precision = information(projection, problem)
         factor = problem.focal.square() * problem.weights * self.refine.kernel.weight(sq_residual, self.shape)
@@ -271,7 +273,7 @@ class _Posterior(NamedTuple):
         return _Component(pose, torch.linalg.cholesky_ex(scaled)[0] / scale[..., None])
 
     def mode(self, poses: Pose, log_weights: Tensor) -> Pose:
-        """The mode to which the pose with the largest importance weight is refined."""
+        """Refine the pose with the largest importance weight to a mode."""
         best = log_weights.argmax(0)
         pose = map_tensors(lambda x: x[best, torch.arange(len(best), device=best.device)], poses)
         starts = Starts(pose, torch.ones_like(self.problem.weights))
@@ -305,7 +307,7 @@ def _sample_t(count: int, like: Tensor) -> Tensor:
 
 
 def _log_t(sq_distance: Tensor, size: int) -> Tensor:
-    """Logarithm of the density of the ``size``-dimensional standard t distribution at vectors of a squared length."""
+    """Log-density of the ``size``-dimensional standard t distribution at vectors of squared length ``sq_distance``."""
     both = 0.5 * (_FREEDOM + size)
     constant = math.lgamma(both) - math.lgamma(0.5 * _FREEDOM) - 0.5 * size * math.log(_FREEDOM * math.pi)
     return constant - both * torch.log1p(sq_distance / _FREEDOM)

@@ -17,23 +17,23 @@ from kornia_pnpnet.result import PnPResult, Pose, Problems, check_poses
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
-# Least probability in the cross entropy. It bounds the loss of a single pair.
+# Least probability in the cross entropy, so that the loss of a single pair is bounded.
 _LEAST_PROBABILITY = 1e-3
-# Variances. Larger squared residuals are clipped to this value, because they are not noise.
+# Variances. Squared residuals are clipped to this value, because larger residuals are not noise.
 _MOST_VARIANCES = 20.0
 
 
 class LossTerms(NamedTuple):
-    """The loss and its terms, each a scalar and a mean over the batch.
+    """The loss and its terms. Each field is a scalar, the mean over the batch.
 
     Attributes:
-        total: weighted sum of the terms. The refined distance of each problem is saturated.
+        total: weighted sum of the terms. The refined distances are saturated, see :class:`PoseLoss`.
         init_rotation: chordal rotation distance of the first guess.
         init_translation: translation distance of the first guess at the centroid of the points.
         refined_rotation: chordal rotation distance after refinement.
         refined_translation: translation distance after refinement.
-        weights: cross entropy of the weights as probabilities of being an inlier; 0 in :class:`PoseLoss`.
-        noise: negative log-likelihood of the inliers under the estimated noise; 0 in :class:`PoseLoss`.
+        weights: cross entropy of the weights, which are inlier probabilities; 0 in :class:`PoseLoss`.
+        noise: negative log-likelihood of the estimated noise; 0 in :class:`PoseLoss`.
     """
 
     total: Tensor
@@ -46,7 +46,7 @@ class LossTerms(NamedTuple):
 
 
 def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    r"""Rotation and translation distances between poses. Their gradients are bounded, even at a distance of 0.
+    r"""Rotation and translation distances between poses. The gradients of the distances are bounded, even at 0.
 
     Args:
         estimate: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -55,7 +55,8 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
             world's origin.
 
     Returns:
-        :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` and :math:`\|\hat t - t\|`, each :math:`(B,)`.
+        The rotation distance :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` for the angle :math:`\theta`, and the
+        translation distance :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
         BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.
@@ -87,8 +88,8 @@ class PoseLoss(nn.Module):
     r"""Weighted sum of the rotation and translation distances of the first guess and of the refined pose.
 
     The refined translation is compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`. The
-    translation of the first guess is compared at the centroid of the world points, because the translation error at an
-    origin far from the points mostly repeats the rotation error.
+    translation of the first guess is compared at the centroid of the world points. At an origin far from the points,
+    the translation error would mostly repeat the rotation error.
 
     The error of a failed refinement has no upper bound. The weighted refined distance :math:`d` of a problem is
     therefore saturated to :math:`d / (1 + d / c)`. If :math:`c` is the largest distance of a successful pose, the loss
@@ -98,7 +99,7 @@ class PoseLoss(nn.Module):
         rotation: weight of the chordal rotation distances.
         translation: weight of the refined translation distance, per unit of length.
         init_translation: weight of the first guess's translation distance, per unit of length.
-        refined: weight of the refined terms relative to the terms of the first guess, for ``ramp=1``.
+        refined: weight of the refined terms for ``ramp=1``. The terms of the first guess have the weight 1.
         saturation: :math:`c`; ``None``: no saturation.
 
     Raises:
@@ -151,26 +152,27 @@ class PoseLoss(nn.Module):
 
 
 class SetLoss(nn.Module):
-    r"""The loss of a set network: poses before and after the refinement, inlier probabilities, and noise.
+    r"""The loss of a set network. The loss trains poses, inlier probabilities and noise.
 
-    The loss has no unit: translation distances at the centroid of the points are divided by the distance of the
+    The loss has no unit, because translation distances at the centroid of the points are divided by the distance of the
     centroid from the camera. The terms are:
 
-    - First guess: a weighted mean of the distance of the best hypothesis and of the mean distance of all hypotheses.
-      The best hypothesis has most of the weight, so that the network can propose different hypotheses.
-    - Refined pose: both distances in units of their limits of success, saturated as in :class:`PoseLoss`.
+    - First guess: a weighted mean of the best hypothesis's distance and the mean distance of all hypotheses. The best
+      hypothesis has most of the weight, so that the network can propose different hypotheses.
+    - Refined pose: the sum of both distances, each divided by its limit of success, and saturated as in
+      :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
-    - Negative log-likelihood of the inliers' residuals at the true pose under the estimated noise.
+    - Negative log-likelihood of the estimated noise, given the inliers' residuals at the true pose.
 
     Args:
-        starts: number of the network's hypotheses. They are the first poses of the starts.
+        starts: number of the network's hypotheses, which are the first poses of the starts.
         every: weight of the mean over the hypotheses. The best hypothesis has the weight ``1 - every``.
         refined: weight of the refined term, for ``ramp=1``.
-        saturation: :math:`c` of :class:`PoseLoss`, in limits of success.
+        saturation: :math:`c` of :class:`PoseLoss`, as a multiple of the limits of success.
         weights: weight of the cross entropy.
         noise: weight of the negative log-likelihood.
-        rotation_unit: limit of success of the rotation, in degrees.
-        translation_unit: limit of success of the translation, as a share of the centroid's distance from the camera.
+        rotation_unit: largest rotation error of a success, in degrees.
+        translation_unit: largest translation error of a success, as a share of the centroid's distance from the camera.
 
     Raises:
         BaseError: for a negative weight, or a saturation or unit that is not positive.

@@ -1,4 +1,4 @@
-"""Inputs of a solver with covariances: pixels from heat maps, and world points from depth."""
+"""Make pixels from heat maps and world points from depth, both with covariances, for a solver."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def heatmap_keypoints(
 
     The softmax of a map is a density that is constant in each cell. The mean of the density is Kornia's soft-argmax.
     The covariance of the density is the covariance of the cells' centres plus the variance of a cell, 1/12 per axis
-    (Sheppard's correction). The covariance is therefore positive definite even if all probability is in one cell. A
-    network can learn maps whose covariance is that of the keypoint's error, by a loss such as
-    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+    (Sheppard's correction). The covariance is therefore positive definite even if all probability is in one cell. With
+    a loss such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`, a network can learn maps whose covariance is
+    the covariance of the keypoint's error.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
@@ -42,12 +42,12 @@ def heatmap_keypoints(
         stride: image pixels per cell of the map. Cell 0 covers the first ``stride`` pixels.
 
     Returns:
-        The pixels, shape :math:`(B, N, 2)`, and their covariances in px², shape :math:`(B, N, 2, 2)`: ``img_points``
-        and ``img_cov`` of a solver. A map with NaN gives NaN, and its problem is then not ``ok``.
+        A solver's ``img_points``, shape :math:`(B, N, 2)`, and its ``img_cov`` in px², shape :math:`(B, N, 2, 2)`. A
+        map with NaN gives NaN, and the problem of the map is then not ``ok``.
 
     Raises:
-        BaseError: when ``heatmaps`` does not have four dimensions or holds booleans or complex numbers, when
-            ``temperature`` is a number that is not positive, or when ``stride`` is not positive.
+        BaseError: when ``heatmaps`` is not a real tensor of four dimensions, or when ``temperature`` or ``stride`` is a
+            number that is not positive.
 
     Example:
         >>> heatmaps = torch.full((1, 1, 5, 5), -100.0)
@@ -89,24 +89,24 @@ def depth_points(
 
     A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
     :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
-    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the
-    derivative of :math:`r` by the pixel and :math:`\Sigma` is the covariance of the pixel. First-order propagation of
-    errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
+    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`. :math:`A` is the derivative
+    of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel. First-order propagation
+    of errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
 
     Args:
         img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`.
         depth: depth along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        depth_sigma: standard deviation of the depth in its unit: a number, :math:`(B,)` or :math:`(B, N)`.
-        img_sigma: see ``PnPNet.forward``. Pixels are exact without this and ``img_cov``.
+        depth_sigma: standard deviation of the depth in the unit of the world, a number, :math:`(B,)` or :math:`(B, N)`.
+        img_sigma: see ``PnPNet.forward``. Pixels are exact if neither ``img_sigma`` nor ``img_cov`` is given.
         img_cov: see ``PnPNet.forward``.
 
     Returns:
-        The points, shape :math:`(B, N, 3)`, and their covariances in squared units of the world, shape
-        :math:`(B, N, 3, 3)`: ``world_points`` and ``world_cov`` of a solver. Both are NaN, without gradient, where the
-        depth is not positive, a pixel or a depth is not finite, or a sigma is negative. The problem of such a pair is
-        not ``ok`` unless the solver's ``mask`` excludes the pair.
+        A solver's ``world_points``, shape :math:`(B, N, 3)`, and its ``world_cov`` in squared units of the world, shape
+        :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its pixel or depth is not
+        finite, or its sigma is negative. The solver's ``mask`` must exclude such a pair, else its problem is not
+        ``ok``.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma

@@ -145,7 +145,7 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
 def success_rate(successes: Tensor) -> SuccessRate:
     r"""Success rate with its 95 % Wilson score interval (E. B. Wilson, 1927).
 
-    Unlike the normal approximation, the interval stays inside [0, 1] and has a positive width at 0 and 1.
+    Unlike the normal approximation, the interval stays inside [0, 1] and has a positive width at rates of 0 and 1.
 
     Args:
         successes: bool, any shape with at least one element.

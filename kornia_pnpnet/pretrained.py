@@ -26,9 +26,9 @@ WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 # Key of the digest in the metadata of the weights file.
 _FINGERPRINT = "sha256"
-# Bytes. At most this much of a configuration file is read. Every configuration is smaller.
+# Bytes. Upper limit of the part of a configuration file that is read. Every valid file is smaller.
 _LARGEST_CONFIG = 2**20
-# Integers up to this value are always accepted in a configuration: tensors of such sizes take little memory.
+# Integers up to this value are always accepted in a configuration, because tensors of such sizes take little memory.
 _SMALL = 1000
 
 
@@ -80,7 +80,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     for name, tensor in state.items():
         if not tensor.isfinite().all():
             raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
-    # Refuse integers that are too large for sizes of these tensors, before a module of such a size is built.
+    # Refuse integers that exceed the sizes of all tensors, before a module of such a size is built.
     largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
     entries = [("", config)]
     while entries:
@@ -101,8 +101,8 @@ def find_weights(name_or_folder: str | Path) -> Path:
     """Find the folder of weights.
 
     Args:
-        name_or_folder: one of :func:`shipped_weights`, a local folder, or a repository id of the Hugging Face Hub. They
-            are searched in this order. Only the Hub needs a network connection.
+        name_or_folder: one of :func:`shipped_weights`, a local folder, or a repository id of the Hugging Face Hub.
+            Shipped weights are searched first, the Hub last.
 
     Raises:
         FileNotFoundError: when no shipped weights, folder or repository has this name.
@@ -151,7 +151,7 @@ class PretrainedMixin(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
-        """Make a solver with another refinement and other options. Both solvers share all unchanged modules."""
+        """Copy the solver with another refinement or other options. Both solvers share all unchanged modules."""
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:

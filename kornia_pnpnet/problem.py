@@ -1,4 +1,4 @@
-"""The data of a solver in its own frame: problems, noise, states, prior terms, and the poses to start from.
+"""The data in a solver's frame: problems, noise, states, prior terms, and starts of the refinement.
 
 Tensors of pairs have the shapes ``(B, N)`` and ``(B, N, C)``. In memory the batch is the last dimension, see
 ``kornia_pnpnet.core.performance.problems_last``.
@@ -18,7 +18,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
 
-#: Focal lengths. Least standard deviation of a pixel, so that weights are finite.
+#: Focal lengths. Least standard deviation of a pixel, so that the weights of exact pixels are finite.
 LEAST_NOISE = 1e-6
 #: Pairs. Least number of pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
@@ -59,10 +59,10 @@ class Noise(NamedTuple):
     r"""The noise of each pair: isotropic standard deviations, and covariances if the caller gave them.
 
     Attributes:
-        img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``:
-            standard deviation of the isotropic noise whose covariance has the same trace. Networks ignore ``img_cov``.
+        img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``,
+            ``img`` belongs to isotropic noise whose covariance has the same trace. Networks ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
-        img_cov: covariance of the pixel, entries of shape :math:`(B, N)`; ``None``: the noise is isotropic.
+        img_cov: covariance of the pixel, each entry of shape :math:`(B, N)`. ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.
     """
 
@@ -83,12 +83,12 @@ class Noise(NamedTuple):
 
 
 class Linear(NamedTuple):
-    r"""A term linearised at a state: its loss is about :math:`w (r + J \delta)^\top \Omega (r + J \delta)`.
+    r"""A term linearised at a state. The loss of the term is about :math:`w (r + J \delta)^\top \Omega (r + J \delta)`.
 
     Attributes:
         residual: :math:`r`, shape :math:`(B, D)`.
-        jacobian: :math:`J`, the derivative by the tangent vector :math:`\delta` of
-            :meth:`~kornia_pnpnet.refine.residual.moved`, shape :math:`(B, D, 6 + K)`.
+        jacobian: :math:`J`, the derivative of :math:`r` with respect to the tangent vector :math:`\delta` of
+            :func:`~kornia_pnpnet.refine.residual.moved`, shape :math:`(B, D, 6 + K)`.
         information: :math:`\Omega`, shape :math:`(B, D, D)`.
         weight: robust weight :math:`w`, shape :math:`(B,)`.
     """
@@ -100,7 +100,7 @@ class Linear(NamedTuple):
 
 
 class Term(Protocol):
-    """A prior of the pose or of the camera: a tuple of tensors whose first dimension is the batch."""
+    """A prior of the pose or of the camera. A term is a tuple of tensors, and their first dimension is the batch."""
 
     def linearise(self, state: State) -> Linear:
         """Linearise the term at a state."""
@@ -109,7 +109,7 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty of poses :math:`(B, …)` when the best start is chosen. An outlier has the penalty 1."""
+        """Penalty of poses :math:`(B, …)` in the choice of the best start. Each outlier pair has the penalty 1."""
 
 
 class Problem(NamedTuple):
@@ -119,19 +119,18 @@ class Problem(NamedTuple):
         world_points: points of the (possibly centred and scaled) world, shape :math:`(B, N, 3)`.
         img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
             shape :math:`(B, N, 2)`.
-        weights: weight of each pair, at least 0; 0 means that the pair is padding, shape :math:`(B, N)`.
+        weights: weight of each pair, at least 0; 0 for padding, shape :math:`(B, N)`.
         focal: the focal length in pixels that all pairs share, a scalar.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
-        usual: 1 for usual pairs, 0 for points far from the other points and pixels at extreme angles (see
-            :class:`~kornia_pnpnet.frame.Normalize`), shape :math:`(B, N)`. Initialisers that are not robust use
-            :attr:`usual_weights`.
+        usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), 0 for all other pairs, shape
+            :math:`(B, N)`. Initialisers that are not robust use :attr:`usual_weights`.
         noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``:
             unknown for all pairs.
         confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`;
             ``None``: unknown for all pairs.
         rig: the transform from the rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose
-            of the problem is that of the rig. ``None``: one camera.
+            of the problem is then the pose of the rig. ``None``: one camera.
         prior: prior of the pose, a :class:`~kornia_pnpnet.refine.terms.PoseTerm`; ``None``: no prior.
         free_focal: range and prior of an unknown focal length, a :class:`~kornia_pnpnet.refine.terms.CameraTerm`;
             ``None``: the focal length is ``focal``.
@@ -172,11 +171,11 @@ class Problem(NamedTuple):
 
     @property
     def places(self) -> Tensor:
-        """The pixel of each pair, :math:`(B, N, 2)`; in a rig its ray (see :meth:`rays`), :math:`(B, N, 3)`."""
+        """The pixel of each pair, :math:`(B, N, 2)`. In a rig, the ray of each pair, :math:`(B, N, 3)`."""
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
     def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays (B, N, 3) of the length ``focal`` in the frame of a rig, through points on the cameras' planes z = 1."""
+        """Rays (B, N, 3) in the rig's frame through points on the planes z = 1. The rays have the length ``focal``."""
         assert self.rig is not None
         rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
         rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
@@ -185,7 +184,7 @@ class Problem(NamedTuple):
     def seen_with(self, zoom: Tensor) -> Problem:
         """The same pairs with a known focal length: ``focal`` times the exponential of ``zoom``, (B, 1) or (B, 0).
 
-        The pixels and their noise are divided by this factor, which has the same effect as another ``focal``.
+        Pixels and their noise are divided by the exponential of ``zoom``, because all problems share ``focal``.
         """
         if not zoom.shape[1]:
             return self
@@ -210,9 +209,9 @@ class Starts(NamedTuple):
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
         ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: all true.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
-        noise: noise of each pair in the units of the problem, without covariances: the caller's noise, or the
-            initialiser's estimate where the caller's noise is unknown. With ``noise``, residuals are measured in
-            standard deviations. ``None``: the initialiser does not estimate noise.
+        noise: noise of each pair in the units of the problem, without covariances. The initialiser's estimate replaces
+            unknown noise of the caller. With ``noise``, residuals are measured in standard deviations. ``None``: the
+            initialiser does not estimate noise.
         camera: initial camera parameters for all poses, see :class:`State`; ``None``: zeros.
     """
 
@@ -225,7 +224,7 @@ class Starts(NamedTuple):
 
     @property
     def poses(self) -> list[Pose]:
-        """A list of ``pose`` and ``others``: rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)` each."""
+        """``pose`` and ``others`` in one list, each pose with the shapes :math:`(B, 3, 3)` and :math:`(B, 3)`."""
         others = () if self.others is None else map(Pose, *(x.unbind(1) for x in self.others))
         return [self.pose, *others]
 

@@ -1,4 +1,4 @@
-"""All solvers by name."""
+"""Build solvers by name."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
-# Iterations of the classical robust LM: few from the pose of another method, many from the identity.
+# Iterations of the classical robust LM: `_FEW` from another method's pose, `_MANY` from the identity.
 _FEW, _MANY = 10, 30
 # Pairs in a sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
@@ -37,7 +37,7 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
 
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """A solver that judges the pose of a method without refining the pose."""
+    """A solver that judges another method's pose without refinement."""
     refine = RobustWeightedLM(0, damping=1e-6, robustness=0.0, learnable=False)
     return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # only RANSAC depends on the order
 
@@ -48,7 +48,7 @@ def _paper_lm(m: int) -> RobustWeightedLM:
 
 
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
-    """The paper's "-LM": a method, and the classical robust LM from the pose of the method."""
+    """The paper's "-LM": the classical robust LM refines the pose of another method."""
     return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
 
 
@@ -95,12 +95,12 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Args:
         name: one of :func:`list_solvers`.
-        options: depend on the solver. Names with ``-lm`` and trained weights take ``m``, the number of iterations (see
-            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). The solvers with EPnP, REPPnP and RANSAC
-            take the arguments of :class:`~kornia_pnpnet.propose.epnp.EPnP`,
-            :class:`~kornia_pnpnet.propose.reppnp.REPPnP` and :class:`~kornia_pnpnet.propose.ransac.RANSAC`. Solvers of
-            other libraries take the arguments of their class in :mod:`kornia_pnpnet.peers`. Solvers of this package
-            also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
+        options: depend on the solver. Trained solvers and names with ``-lm`` take ``m``, the number of iterations (see
+            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers that use
+            :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP` or
+            :class:`~kornia_pnpnet.propose.ransac.RANSAC` take the arguments of that class. Solvers of other libraries
+            take the arguments of their class in :mod:`kornia_pnpnet.peers`. Solvers of this package also take the
+            options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode.
@@ -147,7 +147,7 @@ def solve_pnp(
 ) -> Tensor:
     r"""Find world-to-camera matrices despite outliers, with the signature of :func:`kornia.geometry.solve_pnp_dlt`.
 
-    Solvers of :func:`create_solver` also take masks and noise, and also return weights and a probability.
+    To pass masks or noise, or to get weights and a probability, call a solver of :func:`create_solver`.
 
     Args:
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
@@ -155,13 +155,13 @@ def solve_pnp(
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
         solver: one of :func:`list_solvers`, or a module with the signature of a solver. Named solvers are cached.
-        dist: see ``PnPNet.forward``. Not for solvers of other libraries.
-        fisheye: see ``PnPNet.forward``. Not for solvers of other libraries.
+        dist: see ``PnPNet.forward``. Solvers of other libraries do not accept ``dist``.
+        fisheye: see ``PnPNet.forward``. Solvers of other libraries do not accept ``fisheye``.
 
     Returns:
-        :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`, float64 if any input is float64, else
-        float32. Gradients flow to points, pixels, intrinsics and weights. The matrix of a problem whose ``ok`` is false
-        is NaN without gradient. Such a problem raises no error and does not change other problems.
+        Matrices :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`. The dtype is float64 if any
+        input is float64, else float32. Gradients flow to points, pixels, intrinsics and weights. The matrix of a
+        problem whose ``ok`` is false is NaN without gradient. Such a problem raises no error.
 
     Raises:
         ValueCheckError: for an unknown name.

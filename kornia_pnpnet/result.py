@@ -95,7 +95,7 @@ class Pose(NamedTuple):
 
     @property
     def se3(self) -> Se3:
-        """The pose as Kornia's group element, with gradients. Kornia's tangent vectors are (translation, rotation)."""
+        """The pose as Kornia's ``Se3``, with gradients. Kornia's tangent vectors are (translation, rotation)."""
         return Se3.from_matrix(self.matrix)
 
     def camera(self, intrinsics: Tensor | PinholeCamera, height: int = 1, width: int = 1) -> PinholeCamera:
@@ -123,7 +123,7 @@ class Pose(NamedTuple):
 
 
 def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
-    """Camera matrices (B, 3, 3) or (3, 3) from matrices, or from Kornia's camera, whose extrinsics are ignored."""
+    """Camera matrices (B, 3, 3) or (3, 3) of ``intrinsics``. The extrinsics of Kornia's camera are ignored."""
     if not isinstance(intrinsics, PinholeCamera):
         return intrinsics
     matrices = intrinsics.camera_matrix
@@ -161,10 +161,10 @@ class PosePrior(NamedTuple):
         pose: the expected world-to-camera pose.
         information: inverse of the covariance in radians and the unit of the world, positive semi-definite, shape
             :math:`(B, 6, 6)`. An unknown component of :math:`(\omega, v)` has zeros in its row and column.
-        scale: scale :math:`c` of Welsch's kernel, shape :math:`(B,)`; ``None``: 3. A prior with :math:`k` known
-            directions and a squared Mahalanobis distance of :math:`s` from the pose has the weight
-            :math:`\exp(-2 s / (k c^2))`. An incorrect prior therefore does not spoil a pose that the pairs determine.
-            An infinite scale means least squares.
+        scale: scale :math:`c` of Welsch's kernel, shape :math:`(B,)`; ``None``: 3. Let :math:`k` be the rank of
+            ``information``, and :math:`s` the squared Mahalanobis distance between prior and pose. The weight of the
+            prior is :math:`\exp(-2 s / (k c^2))`. An incorrect prior therefore does not spoil a pose that the pairs
+            determine. With an infinite scale the weight is 1.
     """
 
     pose: Pose
@@ -177,12 +177,12 @@ class Status(IntEnum):
 
     #: The problem is ``ok``.
     SOLVED = 0
-    #: Fewer than 3 pairs remain without padding and without pairs at impossible angles or distances.
+    #: Fewer than 3 pairs have a positive weight and pass the tests of angle and distance in ``Normalize``.
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
-    #: A coordinate, weight, sigma or covariance is NaN or infinite, a weight or sigma is negative, a covariance is not
-    #: positive semi-definite, a confidence is outside of [0, 1], or a prior is impossible.
+    #: An input is invalid: a coordinate, weight or covariance that is not finite, an infinite sigma, a negative weight
+    #: or sigma, a covariance that is not positive semi-definite, a confidence outside of [0, 1], or an invalid prior.
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
@@ -199,10 +199,9 @@ class Alternatives(NamedTuple):
     Attributes:
         rotation: world-to-camera rotations by ascending cost, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
-        cost: cost of each pose (see :class:`PnPResult`) in the refinement that compared the poses, shape
+        cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. The costs are comparable.
+        probability: probability of each pose if the true pose is an alternative or the pose of the result, shape
             :math:`(B, S)`.
-        probability: probability of each pose, provided that an alternative or the pose of the result is the true pose,
-            shape :math:`(B, S)`.
         valid: which slots hold a pose, bool, shape :math:`(B, S)`. Empty slots come last.
     """
 
@@ -229,18 +228,19 @@ class PnPResult(NamedTuple):
         weights: final weight of each pair, in the caller's order, shape :math:`(B, N)`.
         cost: robust loss of the pairs and of a prior, divided by the number of pairs, in the unit of the kernel (see
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
-        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the fields above, the
-            ``intrinsics`` and ``dist`` are finite, and have no gradient unless the solver has ``gradient="always"``.
+        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the fields above,
+            ``intrinsics`` and ``dist`` are finite. These fields then have a gradient only with ``gradient="always"``.
         init: the first guess. The first guess of every valid problem has a gradient, even if the refinement failed, so
             that an initialiser can learn from failures.
-        status: why a problem is not ``ok``: the value of a :class:`Status`, int8, shape :math:`(B,)`.
+        status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
         probability: estimated probability that the rotation error is at most 10 degrees, and the translation error at
-            most 30 % of the distance of the points, shape :math:`(B,)`, without gradient. If the noise is neither given
-            nor estimated by the solver, the probability is computed from the residuals. Solvers of other libraries
-            return 1 where ``ok``.
-        alternatives: other poses that explain the pairs nearly as well; no slots unless the call requested them.
-        intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig as given. An unknown focal
-            length is replaced by its estimate. The identity replaces matrices that are no pinhole cameras.
+            most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. If the noise is
+            neither given nor estimated by the solver, the probability is computed from the residuals. Solvers of other
+            libraries return 1 where ``ok``.
+        alternatives: other poses that explain the pairs nearly as well; empty unless the call requested alternatives.
+        intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`. In a rig the shape may be
+            :math:`(B, N, 3, 3)`. The estimate replaces an unknown focal length. For one camera, the identity replaces
+            an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
     """
 
@@ -268,7 +268,7 @@ class PnPResult(NamedTuple):
 
 
 class Problems(NamedTuple):
-    r"""A batch of problems with their true poses: what every data source yields.
+    r"""A batch of problems with their true poses. Every data source yields such batches.
 
     Attributes:
         world_points: shape :math:`(B, N, 3)`.
@@ -276,14 +276,14 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation, given to a solver, of the noise on each pixel coordinate, shape :math:`(B,)` or
-            :math:`(B, N)`; NaN where unknown; ``None``: unknown for all problems.
+        img_sigma: standard deviation of the noise on each pixel coordinate, an input of solvers, shape :math:`(B,)` or
+            :math:`(B, N)`. NaN: unknown. ``None``: unknown for all problems.
         world_sigma: standard deviation of the noise on each world coordinate; see ``img_sigma``.
         confidence: belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN and ``None`` as for
             ``img_sigma``.
-        img_cov: covariance of the noise of each pixel, given to a solver in place of ``img_sigma``, shape
+        img_cov: covariance of the noise of each pixel, which replaces ``img_sigma`` as an input, shape
             :math:`(B, N, 2, 2)`; ``None``: unknown.
-        world_cov: covariance of the noise of each world point, given to a solver in place of ``world_sigma``, shape
+        world_cov: covariance of the noise of each world point, which replaces ``world_sigma`` as an input, shape
             :math:`(B, N, 3, 3)`; ``None``: unknown.
         cam_from_rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
             ``pose`` is then the pose of the rig. ``None``: one camera.

@@ -33,11 +33,11 @@ from kornia_pnpnet.result import Alternatives, PnPResult, Pose, PosePrior, Statu
 
 __all__ = ["PnPNet"]
 
-# Largest norm of a problem's gradient by normalised coordinates. The gradient of a problem that is ok is about 1 long.
+# Largest norm of the gradient of a problem's loss with respect to normalised inputs. Usual norms are about 1.
 _LONGEST_GRADIENT = 10.0
-# Further iterations from the nominal focal length: the least number that converges with 1000 pairs. With 2, 4 and 8
-# further iterations the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322,
-# half outliers). The gradient of radial distortion comes from these iterations, because the search has no gradient.
+# Additional iterations from a nominal focal length. With 1000 pairs, fewer than four do not converge. With 2, 4 and 8
+# iterations the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half
+# outliers). Radial distortion gets its gradient from these iterations, because the search has no gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -63,9 +63,9 @@ class PnPNet(PretrainedMixin):
     r"""Find the pose of a calibrated camera from 2D-3D correspondences with outliers.
 
     The layer normalises the correspondences, lets ``init`` propose poses, refines and judges the poses, and expresses
-    the best pose in the frame of the inputs. All steps are batched and differentiable. An unsolvable problem
-    (non-finite input, fewer than three pairs, points on a line, a pose that does not explain the pixels) gets
-    ``ok=False``, a ``status`` that says why, and a finite pose without gradient. Other problems do not change.
+    the best pose in the frame of the inputs. All steps are batched and differentiable. An unsolvable problem gets
+    ``ok=False``, a ``status`` with the reason (see :class:`~kornia_pnpnet.result.Status`), and a finite pose without
+    gradient. Other problems of the batch do not change.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``. All
     multiples of a camera matrix are the same camera.
@@ -79,36 +79,34 @@ class PnPNet(PretrainedMixin):
         init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to
             :class:`~kornia_pnpnet.problem.Starts`, see ``kornia_pnpnet.propose``. ``None``: the refinement starts from
             ``init`` or ``prior`` of the call, else from the identity.
-        refine: the refiner; classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM` when ``None``.
+        refine: the refiner. ``None``: a classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM`.
         normalize: the normalisation; the default centres and scales the world and sorts the pairs.
-        effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples
-            (:func:`~kornia_pnpnet.propose.ransac.search_on`), and a pose whose mirror image fits equally well is not
-            ``ok``. This effort needs an initialiser that estimates the noise,
-            :class:`~kornia_pnpnet.propose.set.SetInit`. ``"fixed"``: every problem gets the same work. ``None``:
-            adaptive in evaluation mode if the initialiser estimates the noise and the refinement has iterations, else
-            fixed. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in ``torch.func.vmap``
-            and on the device ``meta``. For rigs and bearings the number of minimal samples is adaptive unless the
-            effort is ``"fixed"`` or the solver is compiled.
+        effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples (see
+            :func:`~kornia_pnpnet.propose.ransac.search_on`). A pose whose mirror image fits equally well is not ``ok``.
+            The initialiser must estimate the noise, as :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``:
+            every problem gets the same work. ``None``: adaptive in evaluation mode if the initialiser estimates the
+            noise and the refinement has iterations, else fixed. The effort is always fixed in exported graphs, with
+            ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``. For rigs and bearings the number
+            of minimal samples is adaptive unless the effort is ``"fixed"`` or the solver is compiled.
         gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``. ``"always"``: all valid
-            problems, to train a network whose poses are still far off. The gradient of each problem by its normalised
-            points, pixels and weights is then finite, and its norm is at most 10.
-        views: number of views of each problem, 1 to 8: the problem itself and mirror images of the problem (see
-            :mod:`kornia_pnpnet.propose.views`). A network proposes different poses for different views. All poses are
-            refined in the first seven tenths of the iterations, and only the best pose in the last three tenths.
+            problems, to train a network whose poses are still inaccurate. The gradient of each problem's loss with
+            respect to its normalised inputs then has a norm of at most 10.
+        views: number of views of each problem, 1 to 8. The first view is the problem itself, and all others are its
+            mirror images (see :mod:`kornia_pnpnet.propose.views`). A network proposes different poses for different
+            views. The first 70 % of the iterations refine all poses, and the last 30 % only the best pose.
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
-            focal length. With ``SetInit`` the refinement starts from a nominal focal length. If this fails, and with
-            other initialisers, the refinement starts from a focal length that a search with P3P finds. A problem is not
-            ``ok`` when the standard deviation of log f exceeds 0.15. ``"known"``: the intrinsics give the focal length.
-        focal_sigma: standard deviation of the logarithm of the focal length in the intrinsics of a call, for example
-            0.1 for a focal length that is known to about 10 %; ``None``: the given focal length is ignored.
-        radial: number of coefficients of radial distortion, 0 to 2, that are estimated with an unknown focal length and
-            returned as ``dist``.
+            focal length. With ``SetInit`` the refinement starts from a nominal focal length. If this refinement fails,
+            or with another initialiser, a search with P3P finds the initial focal length. A problem is not ``ok`` when
+            the standard deviation of log f exceeds 0.15. ``"known"``: the intrinsics give the focal length.
+        focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
+            length is known to about 10 %. ``None``: the caller's focal length is ignored.
+        radial: number of coefficients of radial distortion that are estimated with an unknown focal length, 0 to 2. The
+            result's ``dist`` has the estimates.
 
     Raises:
-        BaseError: when an option is not one of its values or outside its range, when ``effort="adaptive"`` is given
-            without an initialiser that estimates the noise, or when ``focal_sigma`` or ``radial`` is given with a known
-            focal length.
+        BaseError: when an option has an invalid value, when ``effort="adaptive"`` is given without an initialiser that
+            estimates the noise, or when ``focal_sigma`` or ``radial`` is given with a known focal length.
 
     Example:
         >>> from kornia_pnpnet import MLPInit
@@ -177,15 +175,15 @@ class PnPNet(PretrainedMixin):
 
         Args:
             world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. In all arguments and in the result,
-                :math:`B` may be any number of leading dimensions; a single problem has no leading dimension.
-            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, which are directions of any length in the camera's
-                frame (see :func:`~kornia_pnpnet.cameras.bearings`), shape :math:`(B, N, 3)`.
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras, whose
-                extrinsics are ignored; in a rig also one matrix for each pair, :math:`(B, N, 3, 3)`. ``None`` is
-                allowed with bearings. Sigmas and thresholds of bearings are in radians without intrinsics, and in
-                pixels at the given focal length with intrinsics.
+                :math:`B` stands for any number of leading dimensions. A single problem has no leading dimension.
+            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, shape :math:`(B, N, 3)`. Bearings are directions
+                of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras without their
+                extrinsics. In a rig, each pair may have a matrix, shape :math:`(B, N, 3, 3)`. With bearings, ``None``
+                is allowed. Sigmas and thresholds of bearings are in radians without intrinsics, else in pixels at the
+                given focal length.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
-            mask: False where a pair is padding, bool, shape :math:`(B, N)`. The numbers of padding are ignored.
+            mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
                 of the initialiser. Without an initialiser the refinement starts from ``init`` alone.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
@@ -194,27 +192,29 @@ class PnPNet(PretrainedMixin):
             world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
                 shapes and NaN as for ``img_sigma``.
             img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape
-                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite. The refinement whitens the residuals.
+                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite.
             world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
                 :math:`(B, N, 3, 3)`.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. Pairs of high confidence are drawn more often for minimal samples.
-                Networks that were trained with confidences use them as an input. Confidences need not be calibrated.
+                Confidences are an input of networks that were trained with confidences. Confidences need not be
+                calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
-                of the refinement and of the choice among poses. The prior's pose is a start unless ``init`` is given.
-                ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the prior is weighed
-                against pixels with a standard deviation of one pixel.
+                of the refinement and of the choice of the best pose. The prior's pose is a start unless ``init`` is
+                given. ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the refinement
+                with a prior assumes a standard deviation of one pixel.
             dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
             fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out. To keep such pixels, pass bearings.
             cam_from_rig: the transform from a rig of several cameras to the camera of each pair,
-                :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose is then that of the rig.
+                :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The solved pose is then the pose of the rig.
             first_stage_only: return the first guess without refinement (the paper's "Net"), as with ``m=0``.
             gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`; the option of the solver when ``None``.
-            alternatives: largest number of other poses to return that explain the pairs nearly as well. Finding other
-                poses takes as long as several calls without ``alternatives``.
+            alternatives: largest number of alternative poses to return, see
+                :class:`~kornia_pnpnet.result.Alternatives`. The search takes as long as several calls without
+                ``alternatives``.
 
         Returns:
             The :class:`~kornia_pnpnet.result.PnPResult`. Gradients flow through pose, intrinsics, dist, weights and
@@ -280,11 +280,10 @@ class PnPNet(PretrainedMixin):
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
         """Compile the solver in place with ``torch.compile``: the first stage, an iteration, and the final stage.
 
-        The first call then takes some seconds, or less with a disk cache of ``torch.compile``. Further calls take a
-        fraction of the uncompiled time. The size of the batch may change without a new compilation. The first call with
-        another number of pairs, with another dtype, or with gradients compiles again. Parts that cannot be compiled
-        (RANSAC, or all parts without a C++ compiler) run uncompiled after one warning. A copy of the solver compiles
-        again.
+        The first call compiles for some seconds, or less with a disk cache of ``torch.compile``. Further calls take a
+        fraction of the uncompiled time. The size of the batch may change without a new compilation. A new number of
+        pairs, a new dtype, or gradients cause a new compilation. Parts that cannot be compiled (RANSAC, or all parts
+        without a C++ compiler) run uncompiled after one warning. A copy of the solver compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
@@ -295,7 +294,7 @@ class PnPNet(PretrainedMixin):
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
-        """Solve all problems once, then solve some of them again with a better focal length or better noise."""
+        """Solve all problems once, and solve some problems again with a better focal length or better noise."""
         inputs, nominal = self._with_camera(inputs)
         more = _MORE_ITERATIONS if nominal or self.radial else 0
         attempt = self._attempt(inputs, call, more)
@@ -316,12 +315,11 @@ class PnPNet(PretrainedMixin):
         return self._with_alternatives(attempt, result, call.alternatives) if call.alternatives else result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
-        """Set an initial focal length if the focal length is unknown, and tell whether the initial one is nominal."""
+        """Set an initial value of an unknown focal length, and return whether the initial value is nominal."""
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma)
-        # Refinement from a network's poses converges from the nominal focal length. A caller's pose does not fit the
-        # nominal focal length.
+        # A network's poses fit the nominal focal length. A caller's pose does not fit this focal length.
         free = trait(self.init, "estimates_noise") and inputs.init is None and inputs.prior is None
         if free and not self.radial:
             return inputs, True
@@ -331,7 +329,7 @@ class PnPNet(PretrainedMixin):
     def _attempt(self, inputs: Inputs, call: _Call, more: int = 0) -> _Attempt:
         """Propose poses, refine them, and judge the best pose."""
         adapts = self._adapts(inputs, call)
-        searches = adapts and self.focal == "known"  # an unknown focal length has a search of its own
+        searches = adapts and self.focal == "known"  # an unknown focal length has another search
         problem, frame, starts = self._run(self._propose, inputs, call, searches and inputs.confidence is None)
         if searches:
             starts = search_on(problem, starts, keep_others=inputs.init is not None or inputs.prior is not None)
@@ -349,7 +347,7 @@ class PnPNet(PretrainedMixin):
         return _Attempt(problem, frame, starts, refined, self._run(self._result, frame, starts, refined, call))
 
     def _propose(self, inputs: Inputs, call: _Call, search_follows: bool) -> tuple[Problem, Frame, Starts]:
-        """Everything before the refinement: normalise the inputs and propose poses."""
+        """Normalise the inputs and propose poses."""
         problem, frame = self.normalize(*inputs[:5], inputs.noise, inputs.confidence, inputs.rig)
         init = inputs.init
         if call.always:
@@ -375,7 +373,7 @@ class PnPNet(PretrainedMixin):
         return problem, frame, starts
 
     def _result(self, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
-        """Everything after the refinement: express the refined state in the caller's world."""
+        """Express the refined state in the caller's world."""
         pose, first = frame.undo(refined.pose), frame.undo(starts.pose)
         # A sum is finite only if all its terms are finite. The rotation needs no test, because its products with the
         # centroid are terms of the translation.
@@ -414,7 +412,7 @@ class PnPNet(PretrainedMixin):
         return self.effort == "adaptive" or (can and not self.training)
 
     def _shown_sigma(self, attempt: _Attempt, result: PnPResult) -> Tensor:
-        """Sigma of the inliers' residuals in the caller's pixels if far above the estimated noise, else 0, (B, N)."""
+        """Sigma of the inliers' residuals in the caller's pixels, (B, N); 0 unless far above the estimated noise."""
         problem, frame, starts = attempt.problem, attempt.frame, attempt.starts
         assert starts.noise is not None
         assert result.intrinsics is not None
@@ -446,7 +444,7 @@ class PnPNet(PretrainedMixin):
 
 
 def _as_known(problem: Problem, starts: Starts, refined: Refinement) -> tuple[Problem, Starts]:
-    """Make the noise of the refinement and the estimated focal length known parts of the problem."""
+    """Put the noise and the focal length of the refinement into the problem as known values."""
     known = problem._replace(noise=complete_noise(problem, starts))
     return known.seen_with(refined.state.zoom), starts._replace(camera=None)
 
