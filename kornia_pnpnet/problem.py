@@ -153,7 +153,7 @@ class Problem(NamedTuple):
     def of(cls, world_points: Tensor, img_points: Tensor, focal: Tensor | float = 1.0, **more: Any) -> Problem:
         """A problem without normalisation. Weights and scales are 1 unless given in ``more``."""
         one = torch.ones_like(world_points[..., 0])
-        scale = one.new_ones(len(one))
+        scale = one.new_ones(one.shape[0])
         given = {"weights": one, "usual": one, "img_scale": scale, "world_scale": scale, **more}
         return cls(world_points, img_points, focal=torch.as_tensor(focal).to(one), **given)
 

@@ -227,7 +227,8 @@ def present_first(present: Tensor) -> Tensor:
         tensor([[1, 2, 0]])
     """
     places = torch.arange(present.shape[1], device=present.device)
-    return _ascending(torch.where(present, places, places + present.shape[1]))  # unique keys: PyTorch's top-k is not stable
+    # The keys are unique, because PyTorch's top-k is not stable.
+    return _ascending(torch.where(present, places, places + present.shape[1]))
 
 
 def ascending_order(keys: Tensor) -> Tensor:

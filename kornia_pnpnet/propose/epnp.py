@@ -210,7 +210,7 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
     errors = (scaled - torch.bmm(moments, coordinates)).unflatten(1, (2, 4)).transpose(1, 2)  # (B, 4, 2, N)
     error = torch.bmm((weights[:, None] * errors).flatten(2), errors.flatten(2).mT).permute(1, 2, 0)
     eye = torch.eye(4, dtype=weights.dtype, device=weights.device)
-    maps = torch.cat((moments, eye.expand(len(moments), 4, 4)), 1).permute(1, 2, 0).unflatten(0, (3, 4)).contiguous()
+    maps = torch.cat((moments, eye.expand(moments.shape[0], 4, 4)), 1).permute(1, 2, 0).unflatten(0, (3, 4)).contiguous()
     mean_square = control.points[:, 1:].square().sum((1, 2))
     unit = torch.where(control.ok, mean_square, 1.0).sqrt()
     vectors = control.points[:, 1:].permute(2, 1, 0) / unit
@@ -246,7 +246,7 @@ def _null_space(system: _DepthSystem) -> Tensor:
     values, directions = (torch.stack(x, -2) for x in zip(*eigenvectors(error[1:, 1:] + ridge), strict=True))
     along = (error[0, 1:, None] * directions).sum(0) / values  # (3 vectors, B)
     usual = -(along * directions).sum(1, keepdim=True)
-    return torch.cat((eye[:1].expand(1, 4, len(spread)), torch.cat((usual, directions), 1)))
+    return torch.cat((eye[:1].expand(1, 4, spread.shape[0]), torch.cat((usual, directions), 1)))
 
 
 def _four_cases(system: _DepthSystem) -> Tensor:

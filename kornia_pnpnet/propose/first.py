@@ -101,7 +101,7 @@ def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fi
     if fixed or not sees_values(problem.weights):
         starts = _of_fixed_effort(problem._replace(weights=relative(problem.weights, problem.weights), noise=None))
     else:
-        starts = _FINDER(problem._replace(img_scale=problem.focal.expand(len(problem.weights))), given)
+        starts = _FINDER(problem._replace(img_scale=problem.focal.expand(problem.weights.shape[0])), given)
     noise = None
     if with_noise:
         pairs = problems_last(problem)

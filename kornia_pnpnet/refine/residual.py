@@ -388,7 +388,7 @@ def lm_step(
     # rotation vector is the left Jacobian of SO(3).
     rvec = rotation_matrix_to_axis_angle(state.pose.rotation)
     size, matrix = len(equations.gradient), equations.matrix.permute(2, 0, 1)
-    tangent = torch.eye(size, dtype=rvec.dtype, device=rvec.device).repeat(len(rvec), 1, 1)
+    tangent = torch.eye(size, dtype=rvec.dtype, device=rvec.device).repeat(rvec.shape[0], 1, 1)
     tangent[:, :3, :3] = So3.left_jacobian(rvec)
     gradient = (tangent.mT @ equations.gradient.mT[..., None])[..., 0].mT
     delta, solved = solve_positive((tangent.mT @ matrix @ tangent).permute(1, 2, 0), gradient, damping)
