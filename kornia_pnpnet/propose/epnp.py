@@ -210,7 +210,8 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
     errors = (scaled - torch.bmm(moments, coordinates)).unflatten(1, (2, 4)).transpose(1, 2)  # (B, 4, 2, N)
     error = torch.bmm((weights[:, None] * errors).flatten(2), errors.flatten(2).mT).permute(1, 2, 0)
     eye = torch.eye(4, dtype=weights.dtype, device=weights.device)
-    maps = torch.cat((moments, eye.expand(moments.shape[0], 4, 4)), 1).permute(1, 2, 0).unflatten(0, (3, 4)).contiguous()
+    maps = torch.cat((moments, eye.expand(moments.shape[0], 4, 4)), 1)
+    maps = maps.permute(1, 2, 0).unflatten(0, (3, 4)).contiguous()
     mean_square = control.points[:, 1:].square().sum((1, 2))
     unit = torch.where(control.ok, mean_square, 1.0).sqrt()
     vectors = control.points[:, 1:].permute(2, 1, 0) / unit
