@@ -275,7 +275,8 @@ def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part
 
     Args:
         inputs: the batch.
-        most: largest number of pairs in a part per CPU thread. ``None`` or recorded gradients: no limit.
+        most: a part has at most this number of pairs times the number of CPU threads. ``None`` or recorded gradients:
+            no limit.
         any_number: whether problems may be grouped by their number of pairs, so that parts have little padding.
             Grouping saves a third to half of the time if the numbers of pairs differ strongly.
     """

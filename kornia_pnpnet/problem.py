@@ -60,7 +60,7 @@ class Noise(NamedTuple):
 
     Attributes:
         img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``,
-            ``img`` belongs to isotropic noise whose covariance has the same trace. Networks ignore ``img_cov``.
+            ``img`` is the sigma of isotropic noise with the trace of ``img_cov``. Networks ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, each entry of shape :math:`(B, N)`. ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.

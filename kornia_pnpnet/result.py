@@ -200,8 +200,8 @@ class Alternatives(NamedTuple):
         rotation: world-to-camera rotations by ascending cost, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
         cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. The costs are comparable.
-        probability: probability of each pose if the true pose is an alternative or the pose of the result, shape
-            :math:`(B, S)`.
+        probability: probability of each pose, given that the true pose is among the alternatives and the result's pose,
+            shape :math:`(B, S)`.
         valid: which slots hold a pose, bool, shape :math:`(B, S)`. Empty slots come last.
     """
 

@@ -163,7 +163,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 
 
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Yield tables of at most ``batch`` rows from a Parquet file, at least one table."""
+    """Yield tables of at most ``batch`` rows from a Parquet file. An empty file yields one empty table."""
     try:
         # With pre_buffer Arrow would read ahead to the end of the file. Without buffer_size, Arrow would read a whole
         # row group at once.
@@ -179,7 +179,7 @@ def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
 
 
 def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
-    """Yield tables of at most ``batch`` problems from an NPZ file, at least one table."""
+    """Yield tables of at most ``batch`` problems from an NPZ file. An empty file yields one empty table."""
     arrays = read_arrays(shard, INPUTS)
     for name, size in (("world_points", 3), ("img_points", 2)):
         if arrays[name].ndim != 3 or arrays[name].shape[2] != size:

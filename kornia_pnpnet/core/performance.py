@@ -329,9 +329,9 @@ _MANY_PAIRS = 16
 class Compiled:
     """A function of batches that is compiled at its first call.
 
-    The batch size may change without a new compilation, except to or from 1. A new compilation is needed when another
-    size or a dtype changes, or when gradients are switched on or off. If compilation fails, the function warns once and
-    then runs uncompiled. Compilation fails without a C++ compiler and before PyTorch 2.13.
+    The batch size may change without a new compilation, except to or from 1. PyTorch compiles again when the number of
+    pairs or the dtype changes, and when gradients are switched on or off. If compilation fails, the function warns once
+    and then runs uncompiled. Compilation fails without a C++ compiler and before PyTorch 2.13.
 
     Args:
         function: takes tensors and nested tuples of tensors. The first dimension of each non-scalar tensor is the

@@ -57,7 +57,7 @@ class OutlierMix:
             to at least 10. ``None`` means 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
-        structured_ratio: range from which each problem draws its ratio of structured outliers to inliers uniformly.
+        structured_ratio: range of the ratio of structured outliers to inliers, which is uniform over the problems.
         structured_angle: largest rotation angle in radians. The pixels of structured outliers show a rotated and
             shifted copy of the problem's points.
         mirrored_share: probability that a problem also mirrors the copy of the points for its structured outliers.

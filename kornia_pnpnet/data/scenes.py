@@ -108,7 +108,8 @@ class SceneProblems(RandomProblems):
             :class:`SyntheticProblems`.
         outliers: number of outliers and share of mismatches; no outliers are added when ``None``. Scenes of raw matches
             already contain outliers.
-        num_spares: number of spare points per problem. Mismatches get the pixels of the spare points in turn. With the
+        num_spares: number of spare points per problem. The first mismatch gets the pixel of the first
+            spare point, and so on. With the
             protocol's one spare point, all mismatches of a problem share a pixel.
 
     Raises:

@@ -235,8 +235,9 @@ class Search:
     def _expect(self, at: Tensor) -> None:
         """Estimate how many samples some problems need, from the inliers of their best poses.
 
-        After `_prefer_agreement`, the result is the geometric mean of the estimates with and without agreement. On
-        repeated structure, neighbours of outliers agree. The estimate with agreement could then end the search early.
+        After `_prefer_agreement`, the result is the geometric mean of two numbers of samples: with pairs drawn by the
+        agreement of their neighbours, and with equally likely pairs. On repeated structure, neighbours of outliers
+        agree, and the first number alone could end the search early.
         """
         if not len(at):
             return

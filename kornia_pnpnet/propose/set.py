@@ -101,7 +101,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 
 
 def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
-    """Numbers and minimal samples (three ranks). Problems with fewer pairs than the number skip the sample."""
+    """Minimal samples as ranks of three pairs, each after the least number of pairs of a problem that uses it."""
     likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if search_follows:  # the search draws further samples
         return likeliest
@@ -145,8 +145,8 @@ class _Block(nn.Module):
         values, scores = self.look.weight.split((width, heads))
         # The scores have no bias, because the softmax over pairs cancels a bias.
         attention = _attention(y, scores, absent).movedim(0, 1)  # (B, heads, N)
-        # The values are linear in y. The mean of the values is therefore computed from the mean of y, with one product
-        # per problem and head instead of one product per pair.
+        # The values are linear in y, so that the mean of the values follows from the mean of y. One matrix product per
+        # problem and head replaces one per pair.
         means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
         bias = self.look.bias[:width].view(heads, 1, -1)
         context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).reshape(batch, width)

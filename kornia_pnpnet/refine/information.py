@@ -105,7 +105,7 @@ def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> T
 
     Args:
         projection: the points of the problem projected at a state.
-        problem: the problem, with known noise of every pair or without noise.
+        problem: the problem. Its noise is known for every pair or for none.
         most: upper bound of a squared residual in square pixels, a scalar or (B, 1). Points behind the camera have this
             residual. With covariances the bound is multiplied by the mean precision of both coordinates.
 

@@ -411,7 +411,7 @@ def moved(state: State, delta: Tensor) -> State:
 
     The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
     zoom. The origin, which is the centroid of a centred world, then keeps its pixel and its scale. Without this motion,
-    a change of the focal length would move the pixels of distant points almost like a shift along the optical axis.
+    a larger focal length and a smaller distance of the camera would move the pixels of distant points in the same way.
     """
     half, rotation = 0.5 * delta[:3], state.pose.rotation.permute(1, 2, 0)
     factor = 2.0 / (1.0 + half.square().sum(0))
