@@ -30,7 +30,7 @@ _FITTED = 5
 # Largest residuals of an inlier in :func:`search_on`, in standard deviations. The first limit is for the noise that a
 # network estimates, which is too small when most pairs are outliers. The limit is wide, because a missed inlier costs
 # more than an accepted outlier. The second limit is for the noise that the caller gave. On problems of uncertain PnP
-# (`benchmarks/uncertain_problems.py`, seeds 777 and 778, 10 pairs with 5 outliers), limits of 4 and 8 lead to larger
+# (`benchmarks/uncertainty.py`, seeds 777 and 778, 10 pairs with 5 outliers), limits of 4 and 8 lead to larger
 # errors than a limit of 5.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Inlier threshold of `_on_grid`, divided by two factors: the median distance of the pixels from the principal point,
