@@ -76,7 +76,7 @@ class RANSAC(Initialiser):
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
         scorer: ``"msac"`` (truncated squares), ``"inliers"`` (number of outliers), or a function (see
-            :data:`~kornia_pnpnet.propose.scoring.Scorer`). The loss of a pose is the weighted sum of the losses of the
+            ``kornia_pnpnet.propose.scoring.Scorer``). The loss of a pose is the weighted sum of the losses of the
             pairs.
         max_samples: largest number of samples of a problem.
         min_samples: smallest number of samples of a problem. One sample without an outlier may not suffice, because
