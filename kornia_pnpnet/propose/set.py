@@ -285,7 +285,7 @@ class SetInit(Initialiser):
         points = (ranges[..., None] * view.rays).flatten(0, 1)
         source = problem.world_points.expand(starts, -1, -1, -1).flatten(0, 1)
         rotation, translation, _ = align(source, points, counts.flatten(0, 1))
-        poses = [*map(Pose, rotation.chunk(starts), translation.chunk(starts))]
+        poses = [*map(Pose, *(x.unflatten(0, (starts, -1)).unbind() for x in (rotation, translation)))]
         noises = self._noise(given, view, noise)
         if self.samples:
             visible = noises if index is None else _taken(noises, index)
