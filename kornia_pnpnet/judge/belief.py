@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.linalg import solve_symmetric, span_a_plane
+from kornia_pnpnet.core.linalg import solve_positive, solve_symmetric, span_a_plane
 from kornia_pnpnet.core.performance import in_order
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.inliers import MAX_FALSE_ALARMS, Judged, Thresholds, judge, log_false_alarms
@@ -186,14 +186,14 @@ def has_focal(projection: Projection, problem: Problem, noise: Noise, weights: T
     tiny = torch.finfo(weights.dtype).tiny
     share = projection.focal.square().reshape(-1, 1) * (weights / weights.amax(1, keepdim=True).clamp(min=tiny))
     precision = map_tensors(lambda x: share * x, pixel_precision(projection, problem, noise))
-    matrix = normal_equations(projection, problem, precision).matrix.permute(2, 0, 1).double()
-    camera, cross, pose = matrix[:, 6:7, 6:7], matrix[:, :6, 6:7], matrix[:, :6, :6]
-    solved, info = torch.linalg.solve_ex(pose, cross)
+    matrix = normal_equations(projection, problem, precision).matrix.double()
+    pose, cross = matrix[:6, :6], matrix[:6, 6]
+    solution, solved = solve_positive(pose, cross, cross.new_zeros(()))
     # Eliminating the pose gives the information of the focal length (Schur complement).
-    information = (camera - cross.mT @ solved)[:, 0, 0]
+    information = matrix[6, 6] - (cross * solution).sum(0)
     known = problem.free_focal.information
     information = information if known is None else information + known
-    return (info == 0) & (information > _OPEN_FOCAL**-2)
+    return solved & (information > _OPEN_FOCAL**-2)
 
 
 def _span_a_plane(world_points: Tensor, inliers: Tensor) -> Tensor:
