@@ -180,7 +180,7 @@ def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor
     h = 0.5 * b
     s1, s2, s3 = torch.addcmul(b, h, h, value=-1.0)
     # u_1 = -(p u_3 + q u_2). The unknown of the cubic is u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
-    t3, t2 = s3.addcmul_(p, s1, value=-1.0), s2.addcmul_(q, s1, value=-1.0)
+    t3, t2 = torch.addcmul(s3, p, s1, value=-1.0), torch.addcmul(s2, q, s1, value=-1.0)
     k2, k1 = (r * t3).addcmul_(p, g - t2), (r * t2).addcmul_(q, g - t3)
     u3, u2 = _isolated_root(torch.stack(((p * t3).neg_(), k2, k1, (q * t2).neg_())))
     u = torch.stack(((p * u3).addcmul_(q, u2).neg_(), u2, u3))
@@ -205,8 +205,8 @@ def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
     r2, r3 = torch.addcmul(e2, q, e1, value=-1.0), torch.addcmul(e3, p, e1, value=-1.0)
     # e12 = ½ ∂e1/∂dist2, e13 = -½ ∂e1/∂dist3, e23 = ½ ∂e2/∂dist3, e32 = -½ ∂e3/∂dist2,
     # r22 = -½ ∂r2/∂dist2, r32 = -½ ∂r3/∂dist2, r23 = ½ ∂r2/∂dist3, r33 = ½ ∂r3/∂dist3.
-    e12, e13 = torch.addcmul(d1, h1, dist3), d1.addcmul_(h1, dist2, value=-1.0)
-    e23, e32 = d2.addcmul_(h2, dist1), d3.addcmul_(h3, dist1, value=-1.0)
+    e12, e13 = torch.addcmul(d1, h1, dist3), torch.addcmul(d1, h1, dist2, value=-1.0)
+    e23, e32 = torch.addcmul(d2, h2, dist1), torch.addcmul(d3, h3, dist1, value=-1.0)
     r22, r23 = q * e12, e23.addcmul_(q, e13)
     r32, r33 = e32.addcmul_(p, e12), e13.mul_(p)
     det = (r23 * r32).addcmul_(r22, r33, value=-1.0)

@@ -59,11 +59,12 @@ class P3PRig(Configured):
         # Rotations (3, 3, 4 B), translations (3, 4 B) and flags (4 B,); the last dimension contains all slots.
         (rotation, translation), valid = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)).flatten(-2), solved)
         slots = torch.arange(4 * batch, device=rays.device)
+        owners = torch.arange(batch, device=rays.device).repeat(4)
         if sees_values(rays):  # keep only the slots with a solution
             slots = valid.nonzero()[:, 0]
         rotation, translation = (x.index_select(-1, slots) for x in (rotation, translation))
         world, rays, centres, seen, away = (
-            x.contiguous().index_select(-1, slots % batch) for x in (world, rays, centres, seen, away)
+            x.contiguous().index_select(-1, owners[slots]) for x in (world, rays, centres, seen, away)
         )
         # Newton's method starts with the points of the central approximation, projected onto the exact rays.
         cam = small_product(world, rotation.transpose(0, 1)) + translation

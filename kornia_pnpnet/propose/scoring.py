@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.core.performance import exporting
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.inliers import MAX_ERROR, Thresholds
 from kornia_pnpnet.problem import Problem
@@ -115,6 +116,8 @@ class Scene(NamedTuple):
         """
         rows = self.rows.flatten(1, 2)
         x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)
+        if exporting():  # ONNX cannot write into a part of a tensor
+            x, z = x.clone(), z.clone()
         sq_limit = torch.addcmul(self.sq_world, z, z)
         sq_distance = x.mul_(x).addcmul_(y, y).add_(z.clamp_(max=0.0), alpha=-_BEHIND)
         return sq_distance.div_(sq_limit).clamp_(max=MAX_ERROR)
