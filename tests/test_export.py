@@ -187,7 +187,7 @@ def test_packages(n, batch, sizes, make_problems, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["program", "onnx", "package"])
 def test_rigs(kind, tmp_path):
-    solver = PnPNet(SetInit(), RobustWeightedLM(2))
+    solver = PnPNet(SetInit(), RobustWeightedLM(2, kernel="huber"))
     sizes = ((5, 3), (12, 1), (12, 50), (70, 10))
     if kind == "program":
         run = export_program(solver, rig=True).module()
