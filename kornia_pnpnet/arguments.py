@@ -143,8 +143,7 @@ def checked_inputs(
             raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
     KORNIA_CHECK_SHAPE(world_points, ["*", "N", "3"])
     size, count = world_points.shape[:-2], world_points.shape[-2]
-    if isinstance(intrinsics, PinholeCamera) and len(matrices) == size.numel():  # one batch dimension
-        tensors["intrinsics"] = matrices = matrices.reshape(*size, 3, 3)
+    tensors["intrinsics"] = matrices = _of_problems(intrinsics, matrices, size)
     if weights is not None and weights.shape == (*size, count, 2):
         raise ShapeError(
             f"weights must have the shape {(*size, count)}, one for each pair, not one for each of u and v: "
@@ -263,11 +262,15 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, world_points: Tenso
     size = world_points.shape[:-2]
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
-    matrices = camera_matrices(intrinsics).to(like.dtype)
+    matrices = _of_problems(intrinsics, camera_matrices(intrinsics).to(like.dtype), size)
     matrices = matrices / matrices[..., 2:, 2:]
-    if isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3:  # one batch dimension
-        return matrices.reshape(*size, 3, 3)
     return matrices.expand(*size, 3, 3) if matrices.ndim == 2 else matrices
+
+
+def _of_problems(intrinsics: Tensor | PinholeCamera, matrices: Tensor, size: torch.Size) -> Tensor:
+    """Give the matrices of Kornia's cameras, which have one batch dimension, the leading dimensions of the problems."""
+    one_batch = isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3 and len(matrices) == size.numel()
+    return matrices.reshape(*size, 3, 3) if one_batch else matrices
 
 
 def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:

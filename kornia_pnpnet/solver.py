@@ -296,23 +296,25 @@ class PnPNet(PretrainedMixin):
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
         """Solve all problems once, and solve some problems again with a better focal length or better noise."""
         inputs, nominal = self._with_camera(inputs)
-        more = _MORE_ITERATIONS if nominal or self.radial else 0
-        attempt = self._attempt(inputs, call, more)
-        result = attempt.result
-        if self._adapts(inputs, call):
-            if nominal:
-                rows = (~result.ok).nonzero()[:, 0]
-                if len(rows):
-                    again = self._attempt(with_found_focal(take(inputs, rows)), call).result
-                    result = put(result, rows, again)
-            if inputs.noise is None:
-                sigma = self._shown_sigma(attempt, result)
-                rows = (sigma[:, 0] > 0).nonzero()[:, 0]
-                if len(rows):
-                    noise = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
-                    again = self._attempt(take(inputs, rows)._replace(noise=noise), call, more).result
-                    result = put(result, rows, again)
+        attempt, result = self._with_focal(inputs, call, nominal)
+        if inputs.noise is None and self._adapts(inputs, call):
+            sigma = self._shown_sigma(attempt, result)
+            rows = (sigma[:, 0] > 0).nonzero()[:, 0]
+            if len(rows):
+                noise = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
+                _, again = self._with_focal(take(inputs, rows)._replace(noise=noise), call, nominal)
+                result = put(result, rows, again)
         return self._with_alternatives(attempt, result, call.alternatives) if call.alternatives else result
+
+    def _with_focal(self, inputs: Inputs, call: _Call, nominal: bool) -> tuple[_Attempt, PnPResult]:
+        """Solve all problems, and search the focal length of those that a nominal focal length leaves not ``ok``."""
+        attempt = self._attempt(inputs, call, _MORE_ITERATIONS if nominal or self.radial else 0)
+        result = attempt.result
+        if nominal and self._adapts(inputs, call):
+            rows = (~result.ok).nonzero()[:, 0]
+            if len(rows):
+                result = put(result, rows, self._attempt(with_found_focal(take(inputs, rows)), call).result)
+        return attempt, result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
         """Set an initial value of an unknown focal length, and return whether the initial value is nominal."""

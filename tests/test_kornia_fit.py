@@ -103,6 +103,13 @@ def test_solve_pnp_makes_a_solver_once_and_takes_one(make_problems):
         solve_pnp(*p[:3], solver="magic")
 
 
+def test_one_camera_serves_three_problems(make_problems):
+    """Its matrix has as many rows as there are problems."""
+    p = make_problems(n=9, batch=3)
+    solver = create_solver("epnp")
+    assert solver(*p[:2], cameras(p.intrinsics[:1])).matrix.equal(solver(*p[:2], p.intrinsics[0]).matrix)
+
+
 def test_cameras_of_bearings_keep_the_leading_dimensions(make_problems):
     p = make_problems(n=9, batch=6)
     rays = bearings(p.img_points, p.intrinsics)

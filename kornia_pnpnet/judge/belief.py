@@ -32,6 +32,7 @@ __all__ = [
     "explains",
     "has_enough",
     "has_focal",
+    "median_residual",
     "probability",
     "residual_noise",
     "rotation_sigma",
@@ -147,13 +148,20 @@ def clipped(log_alarms: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     return log_alarms.clamp(*_ALARMS), sigma.log().clamp(*_LOG_SIGMA)
 
 
+def median_residual(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
+    """Median of the squared residuals (B, N) of the used pairs ``there`` (B, N), infinite without such a pair, (B, 1).
+
+    A state can fit ``fitted`` pairs exactly, so that the median ignores this number of smallest residuals.
+    """
+    count = there.sum(-1, keepdim=True)
+    ascending = in_order(torch.where(there, sq_residuals, torch.inf).mT[None])[0].mT
+    return ascending.gather(-1, ((count + fitted) // 2).minimum(count - 1).clamp(min=0))
+
+
 def residual_noise(projection: Projection, problem: Problem, weights: Tensor) -> Noise:
     """Estimate the noise of the pixels from the median residual. All pairs of a problem have the same sigma."""
     there = (weights > 0) & projection.in_front
-    count = there.sum(-1, keepdim=True)
-    ascending = in_order(torch.where(there, projection.sq_residual, torch.inf).detach().mT[None])[0].mT
-    middle = ((count + MIN_PAIRS) // 2).minimum(count - 1).clamp(min=0)  # a pose can fit any three pairs
-    variance = ascending.gather(-1, middle) / (2.0 * math.log(2.0))
+    variance = median_residual(projection.sq_residual.detach(), there) / (2.0 * math.log(2.0))
     focal = projection.focal.detach().reshape(-1, 1)
     sigma = variance.minimum(focal.square()).sqrt().maximum(LEAST_NOISE * focal)
     return Noise(sigma.expand_as(weights), torch.zeros_like(weights))

@@ -48,7 +48,7 @@ _CHUNK_BYTES = 2**16
 # Power of the machine epsilon. A candidate is a solution if its triangle differs from the world triangle by less than
 # this power times the distance of the camera. (The longest edge is 1.)
 _ERROR_POWER = 2 / 3
-# The triangle of a solution must also differ from the world triangle by less than this share of the longest edge.
+# Largest difference between the edges of a solution's triangle and of the world triangle, relative to the longest edge.
 _LARGEST_ERROR = 0.01
 # A triangle counts as a line when its height over its size is below this number of machine epsilons. The size includes
 # the distance from the origin.

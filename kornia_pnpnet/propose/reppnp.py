@@ -67,7 +67,7 @@ class REPPnP(Initialiser):
     Args:
         reject_outliers: whether outliers are rejected. If ``False``, all pairs are kept.
         max_error: :math:`\delta_{\max}` as a share of the root mean square radius of the world.
-        quantile: share of the pairs, in (0, 1]. At least this share is kept.
+        quantile: smallest ratio of kept pairs to all pairs, in (0, 1].
         refine_iterations: number of Gauss-Newton steps after the last rejection, at least 1.
 
     Raises:

@@ -12,7 +12,7 @@ from torch.nn import functional
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import compiling, present_first, sees_values
 from kornia_pnpnet.core.trees import map_tensors, take
-from kornia_pnpnet.judge.belief import residual_noise, rotation_sigma
+from kornia_pnpnet.judge.belief import median_residual, residual_noise, rotation_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.minimal import MinimalSolver
@@ -363,12 +363,10 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
     Args:
         sq_residuals: squared residuals, shape (B, N).
         there: which pairs are used, bool, shape (B, N). If a problem uses no pair, its scale is infinite.
-        fitted: number of pairs that a state can fit exactly. The median ignores this number of smallest residuals.
+        fitted: see :func:`~kornia_pnpnet.judge.belief.median_residual`.
     """
-    count = there.sum(-1, keepdim=True)
-    middle = ((count + fitted) // 2).minimum(count - 1).clamp(min=0)
-    median = torch.where(there, sq_residuals, torch.inf).sort(-1).values.gather(1, middle)
-    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, count  # median / (2 log 2) is the variance of a coordinate
+    median = median_residual(sq_residuals, there, fitted)  # median / (2 log 2) is the variance of a coordinate
+    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, there.sum(-1, keepdim=True)
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:

@@ -40,7 +40,7 @@ _POWER_FACTORS = range(-5, 8)
 _LEAST_CONFIDENCE = 0.05
 # Share of inliers among the pairs. With a smaller share, `_information_factor` is 1 and `larger_sigma` is 0.
 _MOST = 0.5
-# Number of rounds of expectation-maximisation that estimate the share of inliers, and lower bound of this share.
+# Expectation-maximisation estimates the ratio of inliers to pairs. Number of its rounds, and least ratio.
 _ROUNDS, _LEAST_SHARE = 2, 0.02
 #: Factor of a variance factor below 1 in the iterations. A kernel of a third of the width separates inliers from near
 #: misses better: without it success falls by 0.5 to 0.7 points on the scene `lund_door`. Tuned on synthetic problems.
