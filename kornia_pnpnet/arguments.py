@@ -328,8 +328,10 @@ def joined(parts: list[Part], results: list[PnPResult]) -> PnPResult:
     padded = []
     for part, result in zip(parts, results, strict=True):
         if part.pairs is not None:
-            weights = result.weights.new_zeros(len(part.pairs), part.most_pairs)
-            result = result._replace(weights=weights.scatter(1, part.pairs, result.weights))
+            assert result.inliers is not None
+            none = result.weights.new_zeros(len(part.pairs), part.most_pairs)
+            weights = none.scatter(1, part.pairs, result.weights)
+            result = result._replace(weights=weights, inliers=(none > 0).scatter(1, part.pairs, result.inliers))
         padded.append(result)
     result = padded[0] if len(padded) == 1 else map_tensors(lambda *x: torch.cat(x), *padded)
     if parts[0].problems is None:

@@ -277,7 +277,7 @@ class _Posterior(NamedTuple):
         best = log_weights.argmax(0)
         pose = map_tensors(lambda x: x[best, torch.arange(len(best), device=best.device)], poses)
         starts = Starts(pose, torch.ones_like(self.problem.weights))
-        return self.refine.iterate(self.refine.begin(self.problem, starts))[0].pose
+        return self.refine.iterate(self.refine.begin(self.problem, starts))[1].state.pose
 
 
 def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[Pose, Tensor]:

@@ -186,7 +186,7 @@ class Status(IntEnum):
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
     CAMERA = 4
-    #: Too few pairs agree with the best pose. Most solvers return this status for problems of three pairs; use
+    #: The pairs are too little evidence for the best pose. Solvers return this status for problems of three pairs; use
     #: :func:`~kornia_pnpnet.propose.p3p.p3p` for such problems.
     NOT_BELIEVED = 5
     #: Fewer than 3 pairs are in front of the camera at the best pose.
@@ -197,7 +197,7 @@ class Alternatives(NamedTuple):
     r"""Other poses that explain the pairs nearly as well as the pose of the result, without gradient.
 
     Attributes:
-        rotation: world-to-camera rotations by ascending cost, shape :math:`(B, S, 3, 3)`.
+        rotation: world-to-camera rotations by descending probability, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
         cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. The costs are comparable.
         probability: probability of each pose, given that the true pose is among the alternatives and the result's pose,
@@ -234,14 +234,16 @@ class PnPResult(NamedTuple):
             that an initialiser can learn from failures.
         status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
         probability: estimated probability that the rotation error is at most 10 degrees, and the translation error at
-            most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. If the noise is
-            neither given nor estimated by the solver, the probability is computed from the residuals. Solvers of other
+            most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. Solvers of other
             libraries return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; empty unless the call requested alternatives.
         intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`. In a rig the shape may be
             :math:`(B, N, 3, 3)`. The estimate replaces an unknown focal length. For one camera, the identity replaces
             an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
+        sigma: standard deviation of a pixel coordinate that the inliers show, in the caller's pixels, shape
+            :math:`(B,)`, without gradient. Noise of the points is included at the usual depth.
+        inliers: which pairs are inliers of the pose, bool, shape :math:`(B, N)`.
     """
 
     rotation: Tensor
@@ -255,6 +257,8 @@ class PnPResult(NamedTuple):
     alternatives: Alternatives | None = None
     intrinsics: Tensor | None = None
     dist: Tensor | None = None
+    sigma: Tensor | None = None
+    inliers: Tensor | None = None
 
     @property
     def pose(self) -> Pose:
@@ -265,6 +269,29 @@ class PnPResult(NamedTuple):
     def matrix(self) -> Tensor:
         """The homogeneous world-to-camera matrix, shape :math:`(B, 4, 4)`."""
         return self.pose.matrix
+
+    def covariance(
+        self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, **noise: Any
+    ) -> Tensor:
+        """The covariance of the pose, a shortcut for :func:`~kornia_pnpnet.covariance.pose_covariance`.
+
+        Args:
+            world_points: the points of the solver's call.
+            img_points: the pixels of the solver's call.
+            intrinsics: the camera matrices of the solver's call, or of the result for an unknown focal length.
+            noise: further arguments of ``pose_covariance``. If no noise of the pixels is given, the noise is
+                ``sigma``. The default weights are ``inliers``.
+
+        Returns:
+            Shape :math:`(B, 6, 6)`, see ``pose_covariance``.
+        """
+        from kornia_pnpnet.covariance import pose_covariance
+
+        if "img_sigma" not in noise and "img_cov" not in noise:
+            noise["img_sigma"] = self.sigma
+        if "weights" not in noise and self.inliers is not None:
+            noise["weights"] = self.inliers.to(self.rotation.dtype)
+        return pose_covariance(self.pose, world_points, img_points, intrinsics, **noise)
 
 
 class Problems(NamedTuple):

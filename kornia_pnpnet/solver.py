@@ -16,18 +16,15 @@ from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Runner, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.frame import Frame, Normalize
-from kornia_pnpnet.judge.belief import LEAST_PROBABILITY
 from kornia_pnpnet.pretrained import PretrainedMixin
-from kornia_pnpnet.problem import Noise, Problem, Starts, State
-from kornia_pnpnet.propose.alternatives import find_alternatives, mirror_probability
+from kornia_pnpnet.problem import Problem, Starts
+from kornia_pnpnet.propose.alternatives import find_alternatives, reconsider
 from kornia_pnpnet.propose.first import propose
 from kornia_pnpnet.propose.focal import as_dist, distorted, scale_focal, with_found_focal, with_nominal_focal
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.propose.ransac import search_on
 from kornia_pnpnet.propose.views import VIEWS
-from kornia_pnpnet.refine.information import complete_noise, larger_sigma
 from kornia_pnpnet.refine.lm import Refinement, RobustWeightedLM
-from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.refine.terms import PoseTerm
 from kornia_pnpnet.result import Alternatives, PnPResult, Pose, PosePrior, Status, gate_pose
 
@@ -82,12 +79,14 @@ class PnPNet(PretrainedMixin):
         refine: the refiner. ``None``: a classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM`.
         normalize: the normalisation; the default centres and scales the world and sorts the pairs.
         effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples (see
-            :func:`~kornia_pnpnet.propose.ransac.search_on`). A pose whose mirror image fits equally well is not ``ok``.
-            The initialiser must estimate the noise, as :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``:
-            every problem gets the same work. ``None``: adaptive in evaluation mode if the initialiser estimates the
-            noise and the refinement has iterations, else fixed. The effort is always fixed in exported graphs, with
-            ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``. For rigs and bearings the number
-            of minimal samples is adaptive unless the effort is ``"fixed"`` or the solver is compiled.
+            :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
+            :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
+            adaptive in evaluation mode if the initialiser estimates the noise and the refinement has iterations, else
+            fixed. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in ``torch.func.vmap``
+            and on the device ``meta``. For rigs and bearings the number of minimal samples is adaptive unless the
+            effort is ``"fixed"`` or the solver is compiled. In evaluation mode, and unless the effort is ``"fixed"``,
+            poses of every solver are compared with their rivals (see
+            :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
         gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``. ``"always"``: all valid
             problems, to train a network whose poses are still inaccurate. The gradient of each problem's loss with
             respect to its normalised inputs then has a norm of at most 10.
@@ -98,7 +97,7 @@ class PnPNet(PretrainedMixin):
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
             focal length. With ``SetInit`` the refinement starts from a nominal focal length. If this refinement fails,
             or with another initialiser, a search with P3P finds the initial focal length. A problem is not ``ok`` when
-            the standard deviation of log f exceeds 0.15. ``"known"``: the intrinsics give the focal length.
+            the pairs leave the focal length open. ``"known"``: the intrinsics give the focal length.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
         radial: number of coefficients of radial distortion that are estimated with an unknown focal length, 0 to 2. The
@@ -294,16 +293,9 @@ class PnPNet(PretrainedMixin):
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
-        """Solve all problems once, and solve some problems again with a better focal length or better noise."""
+        """Solve all problems once, and solve some problems again with a better focal length."""
         inputs, nominal = self._with_camera(inputs)
         attempt, result = self._with_focal(inputs, call, nominal)
-        if inputs.noise is None and self._adapts(inputs, call):
-            sigma = self._shown_sigma(attempt, result)
-            rows = (sigma[:, 0] > 0).nonzero()[:, 0]
-            if len(rows):
-                noise = Noise(sigma[rows], torch.zeros_like(sigma[rows]))
-                _, again = self._with_focal(take(inputs, rows)._replace(noise=noise), call, nominal)
-                result = put(result, rows, again)
         return self._with_alternatives(attempt, result, call.alternatives) if call.alternatives else result
 
     def _with_focal(self, inputs: Inputs, call: _Call, nominal: bool) -> tuple[_Attempt, PnPResult]:
@@ -330,23 +322,25 @@ class PnPNet(PretrainedMixin):
 
     def _attempt(self, inputs: Inputs, call: _Call, more: int = 0) -> _Attempt:
         """Propose poses, refine them, and judge the best pose."""
-        adapts = self._adapts(inputs, call)
+        adapts, rival = self._adapts(inputs, call), None
         searches = adapts and self.focal == "known"  # an unknown focal length has another search
         problem, frame, starts = self._run(self._propose, inputs, call, searches and inputs.confidence is None)
         if searches:
-            starts = search_on(problem, starts, keep_others=inputs.init is not None or inputs.prior is not None)
+            keep_others = inputs.init is not None or inputs.prior is not None
+            starts, rival = search_on(problem, starts, keep_others=keep_others)
         seen = problem
         if inputs.radial is not None:
             seen = distorted(problem, inputs.radial)
             camera = torch.cat((torch.zeros_like(inputs.radial[:, :1]), inputs.radial), 1)
             starts = starts._replace(camera=camera)
-        refined = self.refine(seen, starts, m=0 if call.first_stage_only else None, more=more, run=self._run)
-        if adapts:
-            known = _as_known(problem, starts, refined)
-            mirror = mirror_probability(self.refine, *known, refined.pose, refined.ok & frame.valid, refined.cost)
-            probability = refined.probability * (1.0 - mirror)
-            refined = refined._replace(ok=refined.ok & (probability >= LEAST_PROBABILITY), probability=probability)
-        return _Attempt(problem, frame, starts, refined, self._run(self._result, frame, starts, refined, call))
+        plan = self._run(self.refine.begin, seen, starts)
+        plan, now = self.refine.iterate(plan, 0 if call.first_stage_only else None, more=more, run=self._run)
+        refined = self._run(self.refine.judge, plan, now)
+        if self._compares(inputs, call):
+            refined = reconsider(self.refine, plan, refined, frame.valid, rival)
+        return _Attempt(
+            problem, frame, starts, refined, self._run(self._result, problem.focal, frame, starts, refined, call)
+        )
 
     def _propose(self, inputs: Inputs, call: _Call, search_follows: bool) -> tuple[Problem, Frame, Starts]:
         """Normalise the inputs and propose poses."""
@@ -374,14 +368,14 @@ class PnPNet(PretrainedMixin):
         )
         return problem, frame, starts
 
-    def _result(self, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
+    def _result(self, focal: Tensor, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
         """Express the refined state in the caller's world."""
         pose, first = frame.undo(refined.pose), frame.undo(starts.pose)
         # A sum is finite only if all its terms are finite. The rotation needs no test, because its products with the
         # centroid are terms of the translation.
         finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if starts.ok is None else finite & refined.ok & starts.ok
-        state, intrinsics = refined.state, frame.intrinsics
+        state, intrinsics, found = refined.state, frame.intrinsics, refined.evidence
         if state.camera.shape[1]:
             intrinsics = scale_focal(intrinsics, torch.where(finite, state.camera[:, 0], 0.0).exp())
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
@@ -402,7 +396,14 @@ class PnPNet(PretrainedMixin):
             Alternatives.none(pose),
             None if intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0),
             gate(as_dist(state.radial), live, finite, 0.0),
+            torch.where(finite, found.sigma * focal / frame.img_scale, 0.0),
+            frame.undo_pairs(found.inlier).gt(0.5) & finite[:, None],
         )
+
+    def _compares(self, inputs: Inputs, call: _Call) -> bool:
+        """Whether the poses of a call are compared with their rivals, see :class:`PnPNet`."""
+        fixed = call.first_stage_only or self.effort == "fixed" or inputs.rig is not None or self._whole.compiled
+        return not (fixed or self.training) and sees_values(inputs.world_points)
 
     def _adapts(self, inputs: Inputs, call: _Call) -> bool:
         """Whether the effort of a call is adaptive, see :class:`PnPNet`."""
@@ -413,25 +414,10 @@ class PnPNet(PretrainedMixin):
         can = trait(self.init, "estimates_noise") and self.refine.m > 0
         return self.effort == "adaptive" or (can and not self.training)
 
-    def _shown_sigma(self, attempt: _Attempt, result: PnPResult) -> Tensor:
-        """Sigma of the inliers' residuals in the caller's pixels, (B, N); 0 unless far above the estimated noise."""
-        problem, frame, starts = attempt.problem, attempt.frame, attempt.starts
-        assert starts.noise is not None
-        assert result.intrinsics is not None
-        zoom = (result.intrinsics[:, 0, 0] / frame.intrinsics[:, 0, 0]).log()[:, None]
-        camera = zoom if problem.free_focal is not None else zoom[:, :0]
-        projection = project(State(frame.apply(result.pose), camera), problem)
-        before = frame.undo_pairs(problem.weights)
-        weights = result.weights / torch.where(before > 0, before, 1.0)
-        weights = weights if frame.order is None else weights.gather(1, frame.order)
-        sigma = larger_sigma(projection, problem, starts.noise, weights)
-        return frame.undo_pairs(sigma / frame.img_scale[:, None])
-
     def _with_alternatives(self, attempt: _Attempt, result: PnPResult, most: int) -> PnPResult:
         """Add to a result the other poses that explain the pairs nearly as well."""
-        frame = attempt.frame
-        problem, starts = _as_known(attempt.problem, attempt.starts, attempt.refined)
-        found = find_alternatives(self.refine, problem, starts, frame.apply(result.pose), frame.valid, most)
+        frame, problem = attempt.frame, attempt.problem.seen_with(attempt.refined.state.zoom)
+        found = find_alternatives(self.refine, problem, attempt.starts, frame.apply(result.pose), frame.valid, most)
         poses = frame.undo(Pose(found.rotation, found.translation))
         translation = torch.where(found.valid[..., None], poses.translation, 0.0)
         return result._replace(alternatives=found._replace(translation=translation))
@@ -443,12 +429,6 @@ class PnPNet(PretrainedMixin):
             raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
         if rig and (alternatives or (self.init is None and inputs.init is None)):
             raise ValueCheckError("A rig or bearings have no alternatives, and need an initialiser or `init`.")
-
-
-def _as_known(problem: Problem, starts: Starts, refined: Refinement) -> tuple[Problem, Starts]:
-    """Put the noise and the focal length of the refinement into the problem as known values."""
-    known = problem._replace(noise=complete_noise(problem, starts))
-    return known.seen_with(refined.state.zoom), starts._replace(camera=None)
 
 
 def _checked_gradient(gradient: str) -> str:

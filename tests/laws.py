@@ -402,7 +402,8 @@ def isotropic_covariances_are_sigmas(case: Case) -> None:
     (expected, by_sigma), (found, by_covariance) = results
     assert_near(found, expected)
     if case.dtype == torch.float64:
-        assert_same(by_covariance, by_sigma, 1e-4, 1e-6 * by_sigma.abs().max().item())
+        least = 1e-6 if case.focal == "known" else 1e-2  # the search of the focal length is in float32
+        assert_same(by_covariance, by_sigma, 1e-4, least * by_sigma.abs().max().item())
     with pytest.raises(ValueCheckError, match="img_sigma or img_cov"):
         build(case)(**call, img_sigma=sigma, img_cov=covariance)
 
@@ -466,6 +467,8 @@ def wrong_arguments_are_refused(case: Case) -> None:
         build(case)(**of_pairs(lambda x: x[:, :2], call))
 
 
+#: Laws about problems that are ``ok``. The first guess of a network is not.
+OF_BELIEVED = (batches_are_free, shuffled_is_ordered, units_are_free, frames_are_free)
 LAWS = (
     sound,
     batches_are_free,
@@ -493,7 +496,7 @@ def applies(law: Callable[[Case], None], case: Case) -> bool:
     if case.solver in PEERS:
         return law in (batches_are_free, half_precision_is_converted, wrong_arguments_are_refused)
     if case.solver.startswith("net-"):
-        return law not in (gradients_reach_the_inputs, padding_is_nothing)
+        return law not in (gradients_reach_the_inputs, padding_is_nothing) and law not in OF_BELIEVED
     samples = case.is_ransac or (case.focal == "unknown" and case.solver != "pnpnet-set")
     return not (law is shuffled_is_ordered and samples)
 

@@ -60,6 +60,9 @@ def modules():
 
 MODULES = modules()
 
+#: Methods for users may call a function of a higher layer: ``result.covariance(…)`` calls ``pose_covariance``.
+SHORTCUTS = {(MODULES["result"], "covariance")}
+
 
 @cache
 def imports(path):
@@ -81,6 +84,8 @@ def own_imports(path):
             continue
         below = module.removeprefix("kornia_pnpnet").removeprefix(".")
         inner = f"{below}.{name}".removeprefix(".")
+        if (path, below) in SHORTCUTS:
+            continue
         yield inner if name is not None and inner in MODULES else below or "__init__"
 
 

@@ -141,7 +141,9 @@ def test_a_network_costs_a_product_and_a_sum_for_each_weight():
     assert 2 * weights < alone < 2 * weights + 150 * 20
 
 
-@pytest.mark.parametrize("name", ["epnp-lm", "reppnp-lm", "pnpnet-set:effort=fixed", "pnpnet-n9"])
+@pytest.mark.parametrize(
+    "name", [f"{name}:effort=fixed" for name in ("epnp-lm", "reppnp-lm", "pnpnet-set", "pnpnet-n9")]
+)
 def test_counts_do_not_depend_on_the_data(name, make_problems):
     solver = load_solver(name)
     for outliers in (0, 3):

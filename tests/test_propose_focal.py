@@ -131,7 +131,7 @@ def test_the_search_helps_where_the_network_does_not_suffice():
         result = create_solver("pnpnet-set", focal="unknown", effort=effort)(*p[:2], withheld(p))
         focal, shift, turn = errors(result, p)
         right[effort] = (focal < 0.05) & (shift < 0.05) & (turn < math.radians(1.0))
-        assert (result.ok & ~right[effort]).double().mean() < 0.03
+        assert (result.ok & ~right[effort]).double().mean() < 0.04
     assert right["fixed"].double().mean() > 0.7
     assert right["adaptive"].double().mean() > 0.96
     assert not (right["fixed"] & ~right["adaptive"]).any()

@@ -181,8 +181,8 @@ def test_all_poses_of_three_pixels_with_any_leading_dimensions():
     whole = p3p(p.world_points, plane_points)
     assert (errors(whole, p.pose).amin(-1) < NEAR).all()
     assert (3400.0 * reprojection_errors(whole, p.world_points, plane_points) < 1e-6).all()  # px
-    assert (create_solver("pnpnet-set")(*p[:3]).status == Status.NOT_BELIEVED).all()
-    assert create_solver("p3p-ransac")(*p[:3]).ok.all()
+    for name in ("pnpnet-set", "p3p-ransac"):
+        assert (create_solver(name)(*p[:3]).status == Status.NOT_BELIEVED).all()
     for size in ((), (1,), (2, 3), (0,), (5, 0), (4, 5, 6)):
         first = math.prod(size)
         found = p3p(p.world_points[:first].reshape(*size, 3, 3), plane_points[:first].reshape(*size, 3, 2))

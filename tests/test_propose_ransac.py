@@ -200,7 +200,7 @@ def test_weights_decide_between_two_poses(make_problems):
 
 
 def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
-    for n, outliers in ((3, 0), (4, 0), (5, 0), (9, 3), (40, 28)):
+    for n, outliers in ((6, 0), (9, 3), (40, 28)):
         problems = make_problems(n, 100, outliers=outliers)
         assert solve(solver(**PROTOCOL), problems).ok.double().mean() > 0.97
     for n in (4, 5, 9, 40):

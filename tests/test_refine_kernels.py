@@ -30,7 +30,6 @@ def test_loss_starts_at_zero_and_rises_and_its_derivative_is_the_weight_which_fa
     rounding = 4 * torch.finfo(dtype).eps
     assert (loss[1:] >= loss[:-1] * (1 - rounding)).all()
     assert (weight >= 0).all()
-    assert not kernel.bounded or weight[0] <= 1
     assert (weight[1:] <= weight[:-1] * (1 + rounding)).all()
     if dtype == torch.float64:
         smooth = (SQ_RESIDUALS.sqrt() - shape).abs() > (1e-9 if name == "truncated" else -1.0)
@@ -70,4 +69,3 @@ def test_the_power_kernel_is_the_papers_above_its_floor():
     s = tensor([0.0, 1.0, 4.0, 1e6])
     torch.testing.assert_close(KERNELS["power"].weight(s[3], tensor(1.0)), tensor(1e-3), rtol=1e-6, atol=0)  # 1/‖r‖^α
     torch.testing.assert_close(KERNELS["power"].loss(s, tensor(2.0)), torch.log1p(s / 0.01))
-    assert [name for name, kernel in KERNELS.items() if not kernel.bounded] == ["power"]

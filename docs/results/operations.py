@@ -98,7 +98,7 @@ _ELEMENTWISE = {
         ("lerp", 2 * ADD + MULTIPLY),
         ("linalg_cross", ADD + 2 * MULTIPLY),
         ("ceil clamp_min eq ge gt isinf isnan le lt maximum minimum ne relu", COMPARE),
-        ("abs copysign nan_to_num sgn sign", 2 * COMPARE),
+        ("abs copysign nan_to_num round sgn sign", 2 * COMPARE),
         ("bitwise_and bitwise_not bitwise_or logical_or masked_fill where", LOGIC),
     )
     for name in names.split()
@@ -132,6 +132,7 @@ _MATRIX: dict[str, Callable[..., float]] = {
 _ROWS: dict[str, Callable[[int, dict[str, Any]], float]] = {
     "linalg_vector_norm": lambda n, _: (n - 1) * ADD + n * MULTIPLY + SQRT,
     # Subtract the maximum, divide the exponentials by their sum.
+    "logsumexp": lambda n, _: 2 * (n - 1) * ADD + n * EXP + LOG + (n - 1) * COMPARE,
     "_softmax": lambda n, _: (2 * n - 1) * ADD + n * (DIVIDE + EXP) + (n - 1) * COMPARE,
     # Subtract the mean, divide by the root of variance plus epsilon, apply weight and bias.
     "native_layer_norm": lambda n, _: (4 * n - 1) * ADD + 3 * n * MULTIPLY + 3 * DIVIDE + SQRT,

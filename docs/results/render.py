@@ -102,6 +102,20 @@ def honesty(found: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def belief(found: Mapping[str, Any]) -> str:
+    """How many far-off poses and how many right poses are ``ok``, by kind of problem and solver."""
+    names = [name for name in found if name not in ("environment", "law")]
+    lines = []
+    for kind in found[names[0]]["kinds"]:
+        line = [kind]
+        for name in names:
+            rates = found[name]["kinds"][kind]
+            shares = (rates.get(key) for key in ("ok_of_far", "ok_of_right"))
+            line.append(" / ".join("–" if x is None else f"{100 * x['rate']:.1f}" for x in shares))
+        lines.append(line)
+    return markdown_table(["`ok` of far-off / of right poses (%)", *(f"`{name}`" for name in names)], lines)
+
+
 def page() -> str:
     """The results page as Markdown."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
@@ -129,6 +143,7 @@ def page() -> str:
         beside_peers=compare_all((rates["set"], rates["set_real"]), ANY, PEERS),
         ours_beside_peers=compare_all((rates["paper"], rates["gaussian_pose"], rates["real"]), OURS, PEERS),
         honest=honesty(load("honesty")),
+        belief=belief(load("probability")),
         chi_square=CHI_SQUARE_95,
         distribution_table=format_table(results["distribution"]),
         ablation=ablation(runs["ablation"]),

@@ -154,6 +154,10 @@ class PeerSolver(nn.Module):
         truncated = _squared_errors(poses[0], world, img, cameras).clamp(max=min(self.threshold, largest**0.25) ** 2)
         cost = torch.where(used, truncated, 0.0).sum(-1) / used.sum(-1).clamp(min=1)
 
+        kept = inliers > 0
+        freedom = (2.0 * kept.sum(-1) - 6.0).clamp(min=1.0)
+        sigma = (torch.where(kept, truncated, 0.0).sum(-1) / freedom).sqrt()
+
         def back(values: Tensor) -> Tensor:
             return values.clamp(-largest, largest).to(like)
 
@@ -169,6 +173,8 @@ class PeerSolver(nn.Module):
             alternatives=Alternatives.none(pose),
             intrinsics=back(torch.where(pinhole[:, None, None], cameras, torch.eye(3).double())),
             dist=like.new_zeros(len(like), 4),
+            sigma=back(sigma),
+            inliers=(inliers > 0).to(like.device),
         )
         return restore_leading(size, result)
 

@@ -10,16 +10,17 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import eigenvectors
 from kornia_pnpnet.core.performance import repeat_problems
-from kornia_pnpnet.core.trees import map_tensors, take
-from kornia_pnpnet.judge.belief import has_enough, residual_noise
+from kornia_pnpnet.core.trees import map_tensors, put, take
+from kornia_pnpnet.judge.belief import LEAST_PROBABILITY
+from kornia_pnpnet.judge.evidence import evidence
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.p3p import p3p
 from kornia_pnpnet.propose.scoring import as_entries, as_pose
-from kornia_pnpnet.refine.lm import Refinement, RobustWeightedLM
+from kornia_pnpnet.refine.lm import Plan, Progress, Refinement, RobustWeightedLM, taken
 from kornia_pnpnet.refine.residual import project, rotation_angle
 from kornia_pnpnet.result import Alternatives, Pose
 
-__all__ = ["find_alternatives", "mirror_probability"]
+__all__ = ["find_alternatives", "reconsider"]
 
 # Another pose is kept when its likelihood is at least this fraction of the likelihood of the refinement's pose.
 _LIKELY = 1e-3
@@ -30,15 +31,21 @@ _LIKELIER = 30.0
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
 # A mirror image is refined if its median residual is below the first number times the spread of the pixels. With fewer
 # likely inliers than the second number, the mirror image is always refined.
-_NEAR_MIRROR, _FEW_INLIERS = 0.2, 10
-# After the first number of iterations, a mirror image is dropped if its log-likelihood minus the log-likelihood of the
-# pose is below the second number.
-_FIRST_LOOK, _HOPELESS = 2, -30.0
-# A mirror image within this angle (radians) of the pose does not lower the pose's
+_NEAR_MIRROR = 0.2
+# With a larger share of inliers, a pose has no rivals of other noise.
+_CLEAR = 0.9
+# Rivals of other noise: the factor of the variance, and the least standard deviation in radians.
+_WIDE_ANGLE, _WIDE_FROM, _GAP = 6.4e-3, 4, 0.4
+# The caller's rivals: factor by which the first variance is smaller, least angle from the pose, and largest share of
+# inliers of a pose that has such a rival.
+_SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.005, 0.97
+# Number of iterations of a rival at this noise, and number of further iterations.
+_FROZEN, _FREE = 3, 5
+# A rival within this angle (radians) of the pose does not lower the pose's
 # :attr:`~kornia_pnpnet.result.PnPResult.probability`.
 _FAR_TURN = math.radians(10.0)
-# If the solver does not refine (``m=0``), other poses are refined by this number of iterations with a Cauchy kernel.
-_ITERATIONS = 20
+# Number of iterations by residual from each start, at the noise of the pose.
+_ITERATIONS = 12
 
 
 @torch.no_grad()
@@ -64,26 +71,23 @@ def find_alternatives(
         The other poses in the frame of the problem.
     """
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
-    weights = problem.weights * starts.weights
-    middle = _mean(problem.world_points, weights)
-    mirrored = _mirrored(pose, problem, weights)
-    every = [*map(as_entries, (pose, mirrored)), *_of_three(problem, weights, pose), *map(as_entries, starts.poses)]
-    count, batch = len(every), weights.shape[0]
-    many, factors, noise = repeat_problems((problem, starts.weights, starts.noise), count)
-    tried = Starts(as_pose(torch.cat(every)), factors, noise=noise)
-    refine = refine if refine.m else RobustWeightedLM(_ITERATIONS, kernel="cauchy", learnable=False)
-    for _ in range(2):
-        refined = refine(many, tried)
-        tried = tried._replace(pose=refined.pose)
-    unrefined = refine(problem, starts._replace(pose=mirrored, others=None, camera=None), m=0)
-    ends, cost, usable = (x.unflatten(0, (count, batch)) for x in _ends(refined))  # (S, B, ...)
+    plan = refine.begin(problem, starts._replace(pose=pose, others=None, camera=None))
+    plan, now = refine.shown(plan, Progress.of(plan.state))
+    inlier = refine.judge(plan, now).evidence.inlier
+    middle, mirrored = _mean(problem.world_points, inlier), _mirrored(pose, problem, inlier)
+    every = [*map(as_entries, (pose, mirrored)), *_of_three(problem, inlier, pose), *map(as_entries, starts.poses)]
+    count, batch = len(every), inlier.shape[0]
+    many, mixture = repeat_problems((plan, now.mixture), count)
+    tried = Progress.of(State.of(as_pose(torch.cat(every))), mixture)
+    step, damping, _ = plan.hyperparameters[-1]
+    for _ in range(_ITERATIONS):
+        tried = refine.by_residuals(many, tried, torch.ones_like(many.known), step, damping)
+    unrefined = refine.judge(plan, Progress.of(State.of(mirrored), now.mixture))
+    ends, cost, likelihood, usable = (x.unflatten(0, (count, batch)) for x in _ends(refine.judge(many, tried)))
     lost = _are_same(ends[1], every[0], middle)
-    for x, image in zip((ends, cost, usable), _ends(unrefined), strict=True):
+    for x, image in zip((ends, cost, likelihood, usable), _ends(unrefined), strict=True):
         x[1, lost] = image[lost]
-
-    # Costs are means over the pairs. Log-likelihoods are sums over the pairs.
-    unit = (problem.weights > 0).sum(-1) / _unit(problem, starts, as_pose(ends[0]))
-    log_ratio = (-0.5 * unit * (cost - cost[0])).clamp(max=_LIKELIER)
+    log_ratio = (likelihood - likelihood[0]).clamp(max=_LIKELIER)
     log_ratio = torch.where(usable & (log_ratio > math.log(_LIKELY)), log_ratio, -torch.inf)
     log_ratio, order = log_ratio.sort(dim=0, descending=True, stable=True)
     ends, cost = ends.take_along_dim(order[..., None], 0), cost.take_along_dim(order, 0)
@@ -104,51 +108,79 @@ def find_alternatives(
     return Alternatives(rotation, translation, cost.mT, probability.take_along_dim(position, 0).mT, chosen.mT)
 
 
-@torch.no_grad()
-def mirror_probability(
-    refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, ok: Tensor, cost: Tensor
-) -> Tensor:
-    """Compute the probability (B,) that the refined mirror image is the correct pose instead of the given pose.
+def reconsider(
+    refine: RobustWeightedLM, plan: Plan, refined: Refinement, valid: Tensor, rival: Pose | None = None
+) -> Refinement:
+    """Compare refined poses with rivals, and keep the likeliest pose if the refinement has iterations by residual.
 
-    The probability is 0 if the pose is not ``ok``, or if the refined mirror image is within 10 degrees of the pose.
+    One rival starts from the refined pose with a larger noise, if the residuals are almost as likely with this noise.
+    Another rival starts from the mirror image of the pose, if the mirror image has small residuals. The caller's rival
+    starts with a smaller noise, if it differs from the pose. A rival that ends more than 10 degrees from the result
+    lowers the probability of the result.
 
     Args:
-        refine: See find_alternatives.
-        problem: See find_alternatives.
-        starts: See find_alternatives.
-        pose: See find_alternatives.
-        ok: which poses pass all other tests, bool (B,).
-        cost: the costs of the poses, (B,).
+        refine: the refinement.
+        plan: the plan of the refinement.
+        refined: the result of the refinement.
+        valid: which problems are valid (see :class:`~kornia_pnpnet.frame.Frame`), bool (B,).
+        rival: another pose of each problem; ``None``: no such pose.
+
+    Returns:
+        The results with their probabilities.
     """
-    weights = problem.weights * starts.weights
-    away = (problem.img_points - _mean(problem.img_points, weights)[:, None]).square().sum(-1)
-    spread = _mean(away[..., None], weights)
-    mirrored = _mirrored(pose, problem, weights)
-    projection = project(State.of(mirrored), problem)
-    close = projection.in_front & (projection.sq_residual < _NEAR_MIRROR**2 * spread)
-    few = (weights > 0.5).sum(-1) < _FEW_INLIERS
-    rows = (ok & (few | (_mean(close[..., None], weights)[:, 0] > 0.5))).nonzero()[:, 0]
-    probability = torch.zeros_like(cost)
-    start = Starts(mirrored, starts.weights, noise=starts.noise)
-    for m in (_FIRST_LOOK, refine.m):
-        if not len(rows):
-            return probability
-        begun = refine.begin(take(problem, rows), take(start, rows))
-        end, _ = refine.iterate(begun, m)
-        of_end = refine.cost(begun, end)
-        unit = 0.5 * (begun.problem.weights > 0).sum(-1) / _unit(problem, start, pose)[rows]
-        log_ratio = torch.where(of_end.isfinite(), unit * (cost[rows] - of_end), -torch.inf)
-        if m < refine.m:
-            rows = rows[log_ratio > _HOPELESS]
-    usable = has_enough(project(end, begun.problem), begun.problem.weights)
-    usable &= rotation_angle(end.pose.rotation, pose.rotation[rows]) > _FAR_TURN
-    probability[rows] = torch.where(usable, log_ratio.sigmoid(), 0.0)
-    return probability
+    found, problem, by_residual = refined.evidence, plan.problem, refine.by_residual > 0
+    with torch.no_grad():
+        mirrored = _mirrored(refined.pose, problem, found.inlier)
+        away = (problem.img_points - _mean(problem.img_points, found.inlier)[:, None]).square().sum(-1)
+        sq_spread = _mean(away[..., None], found.inlier)
+        projection = project(State(mirrored, refined.state.camera), problem)
+        close = projection.in_front & (projection.sq_residual < _NEAR_MIRROR**2 * sq_spread)
+        mirrors = valid & refined.ok & (_mean(close[..., None], found.inlier)[:, 0] > 0.5)
+        free, share = valid & refined.in_front & ~plan.known[:, 0] & by_residual, found.mixture.share[:, 0]
+        gap = found.likelihood - found.grid[:, _WIDE_FROM:].amax(1)
+        unclear = free & (share < _CLEAR) & (gap < _GAP * plan.votes.sum(-1))
+        rival = refined.pose if rival is None else rival
+        apart = rotation_angle(rival.rotation, refined.pose.rotation) > _APART
+        apart &= valid & (share < _CLEAR_OF_RIVALS) & by_residual
+        own = found.mixture
+        wide = own._replace(variance=own.variance.maximum(_WIDE_ANGLE**2 * found.radian))
+        narrower = torch.where(plan.known, 1.0, 1.0 / _SMALLER)
+        narrow = own._replace(variance=narrower * own.variance, least=narrower.square() * own.least)
+        chosen = [x.nonzero()[:, 0] for x in (unclear, unclear, mirrors, apart)]
+    owners = torch.cat(chosen)
+    if not len(owners):
+        return refined
+    kind = torch.cat([torch.full_like(rows, i + 1) for i, rows in enumerate(chosen)])
+    poses, mixtures = (refined.pose, refined.pose, mirrored, rival), (own, wide, own, narrow)
+    starts = [taken((x, y), rows) for x, y, rows in zip(poses, mixtures, chosen, strict=True)]
+    pose, mixture = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *starts)
+    every = taken(plan._replace(state=refined.state, starts=1), owners)
+    now = Progress.of(every.state._replace(pose=pose), mixture)
+    step, damping, _ = plan.hyperparameters[-1]
+    for i in range(_FROZEN + _FREE):
+        now = refine.by_residuals(every, now, every.known | (i < _FROZEN), step, damping)
+    of_ends = evidence(project(now.state, every.problem), every.problem, every.votes, every.known)
+    # By kind of the rival (0: the refined pose) and by problem, (5, B).
+    likelihood = found.likelihood.new_full((len(chosen) + 1, len(valid)), -torch.inf)
+    end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()
+    likelihood[0] = found.likelihood
+    likelihood[kind, owners] = of_ends.likelihood.nan_to_num(-torch.inf)
+    end[kind, owners] = torch.arange(len(owners), device=owners.device)
+    if by_residual:
+        best = likelihood.argmax(0)
+        rows = best.nonzero()[:, 0]
+        at = end[best[rows], rows]
+        refined = put(refined, rows, refine.judge(take(every, at), take(now, at), take(of_ends, at)))
+    far = rotation_angle(now.state.pose.rotation, refined.pose.rotation[owners]) > _FAR_TURN
+    others[kind, owners] = torch.where(far, likelihood[kind, owners], -torch.inf)
+    probability = refined.probability * (likelihood.amax(0) - others.amax(0)).sigmoid()
+    return refined._replace(probability=probability, ok=refined.ok & (probability >= LEAST_PROBABILITY))
 
 
-def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries and costs of the refined poses. A pose is usable if its cost is finite and enough points are in front."""
-    return as_entries(refined.pose), refined.cost, refined.in_front & refined.cost.isfinite()
+def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Entries, costs and log-likelihoods of poses. A pose is usable if its cost is finite and it sees enough points."""
+    usable = refined.in_front & refined.cost.isfinite()
+    return as_entries(refined.pose), refined.cost, refined.evidence.likelihood, usable
 
 
 def _mean(points: Tensor, weights: Tensor) -> Tensor:
@@ -197,14 +229,6 @@ def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor
     solved = p3p(points[rows, index], problem.img_points[rows, index] / problem.focal)
     entries = torch.where(solved.valid[..., None], as_entries(solved.pose), as_entries(fallback)[:, None])
     return entries.unbind(1)
-
-
-def _unit(problem: Problem, starts: Starts, pose: Pose) -> Tensor:
-    """Squared standard deviation (B,) in the unit of the refinement's cost."""
-    if problem.noise is not None or starts.noise is not None:
-        return torch.ones_like(problem.weights[:, 0])
-    noise = residual_noise(project(State.of(pose), problem), problem, problem.weights * starts.weights)
-    return noise.img[:, 0].square()
 
 
 def _are_same(poses: Tensor, other: Tensor, middle: Tensor) -> Tensor:

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import present_first, problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.belief import residual_noise
-from kornia_pnpnet.judge.inliers import Thresholds, judge
+from kornia_pnpnet.judge.inliers import Thresholds, judge, residual_noise
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.propose.p3p import P3P

@@ -2,8 +2,6 @@ r"""RANSAC: the pose with the best score among the poses of many small samples, 
 
 from __future__ import annotations
 
-import math
-
 import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import ShapeError, ValueCheckError
@@ -13,12 +11,12 @@ from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import compiling, problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.inliers import MAX_FALSE_ALARMS, Judged, Thresholds, judge, log_false_alarms
-from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, Starts, State
+from kornia_pnpnet.judge.inliers import Judged, Thresholds, judge
+from kornia_pnpnet.problem import LEAST_NOISE, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.minimal import MinimalSolver, describe
 from kornia_pnpnet.propose.p3p import P3P
-from kornia_pnpnet.propose.scoring import SCORERS, Scorer
+from kornia_pnpnet.propose.scoring import SCORERS, Scorer, as_pose
 from kornia_pnpnet.propose.search import Search, cauchy_scale, least_squares
 from kornia_pnpnet.refine.residual import Projection, project
 from kornia_pnpnet.result import Pose
@@ -56,10 +54,6 @@ class RANSAC(Initialiser):
     of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points. An error of a point moves the
     projection by :math:`f/z` times the error. In least squares, the weight of an inlier is the inverse of the
     right-hand side. The final steps multiply this weight by the weight of a Cauchy kernel.
-
-    A pose is ``ok`` when fewer than 0.01 poses are expected to have as many inliers by chance (see
-    :func:`~kornia_pnpnet.judge.inliers.log_false_alarms`). Three pairs cannot show whether a pose is correct. A problem
-    of three pairs is therefore ``ok`` when it has a pose.
 
     Pairs to which the caller gave a large confidence are drawn more often than other pairs.
 
@@ -186,16 +180,7 @@ class RANSAC(Initialiser):
             search.run(given)
         projection, judged = self._refined(problems_last(problem), search.state, stages)
         pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
-        with torch.no_grad():
-            projection, counts = map_tensors(torch.Tensor.detach, projection), (fixed.weights > 0).sum(-1)
-            # Each pose is tested once for each possible number of inliers, from 4 to the number of pairs.
-            tests = search.scored * (counts - MIN_PAIRS).clamp(min=1)
-            alarms = log_false_alarms(tests, projection, problems_last(fixed), thresholds, judged)
-            ok = alarms < math.log(MAX_FALSE_ALARMS)
-            if fixed.free_focal is None:
-                ok |= (judged.inliers == MIN_PAIRS) & (counts == MIN_PAIRS)
-            ok &= search.loss.isfinite()
-        return Starts(_recentred(pose, -centre), judged.weights.contiguous(), ok, camera=camera)
+        return Starts(_recentred(pose, -centre), judged.weights.contiguous(), search.loss.isfinite(), camera=camera)
 
     def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[Projection, Judged]:
         """Improve poses on their inliers. Each stage selects the inliers once, by its own thresholds."""
@@ -245,7 +230,7 @@ def _trusted(problem: Problem) -> Tensor:
 
 
 @torch.no_grad()
-def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> Starts:
+def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, Pose]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
     If a pair has the weight :math:`w` in the starts, its chance to be drawn is proportional to :math:`0.8 + 0.2 w`. A
@@ -268,9 +253,10 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
             gave a pose or a prior, because a search on few pairs can lead away from the correct pose.
 
     Returns:
-        The starts with the best pose, without gradient. A searched problem has new weights, because the network's
-        weights misled the first pose. The new weights are those of a Cauchy kernel at the best pose. The scale of the
-        kernel is the inlier threshold.
+        First, the starts with the best pose, without gradient. A searched problem has new weights, because the
+        network's weights misled the first pose. The new weights are those of a Cauchy kernel at the best pose. The
+        scale of the kernel is the inlier threshold. Second, the best pose by a quarter of the thresholds, a rival of
+        the refined pose.
 
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.
@@ -291,10 +277,11 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     thresholds = Thresholds(limit, torch.zeros_like(depth))
     chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
     given = map_tensors(lambda *x: torch.stack(x, 1), *constant.poses)
-    search = Search(_FURTHER, problem, thresholds, chances, sigma)
+    search = Search(_FURTHER, problem, thresholds, chances, sigma, finds_rivals=True)
     search.run(given, enough=_FURTHER.min_samples)
     state = search.state
     judged = judge(project(state, problems_last(problem)), problem, thresholds)
     weights = torch.where((search.drawn > 0)[:, None], 1.0 / (1.0 + judged.errors), constant.weights)
     others = starts.others if keep_others else None
-    return starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera)
+    rival = map_tensors(lambda x: x.to(problem.weights), as_pose(search.rivals))
+    return starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera), rival

@@ -101,9 +101,13 @@ class Scene(NamedTuple):
         rows = self.rows.gather(2, positions[:, None, :, None].expand(-1, 3, -1, 13))
         return self._replace(rows=rows, weights=self.weights.gather(2, positions[:, None]))
 
-    def losses(self, poses: Tensor, scorer: Scorer) -> Tensor:
-        """Losses (P, H) of poses (P, 12, H): the weighted sum of the pairs' losses, plus the loss of the prior."""
-        losses = (self.weights @ scorer(self.errors(poses)))[:, 0]
+    def losses(self, poses: Tensor, scorer: Scorer, narrower: float = 1.0) -> Tensor:
+        """Losses (P, H) of poses (P, 12, H): the weighted sum of the pairs' losses, plus the loss of the prior.
+
+        Squared residuals are multiplied by ``narrower``.
+        """
+        errors = self.errors(poses)
+        losses = (self.weights @ scorer(errors if narrower == 1.0 else errors.mul_(narrower)))[:, 0]
         if self.prior is None:
             return losses
         prior = map_tensors(lambda x: x[:, None], self.prior)  # broadcasts over H poses

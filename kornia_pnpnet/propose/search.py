@@ -12,8 +12,8 @@ from torch.nn import functional
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import compiling, present_first, sees_values
 from kornia_pnpnet.core.trees import map_tensors, take
-from kornia_pnpnet.judge.belief import median_residual, residual_noise, rotation_sigma
-from kornia_pnpnet.judge.inliers import Thresholds, judge
+from kornia_pnpnet.judge.belief import pose_sigma
+from kornia_pnpnet.judge.inliers import Thresholds, judge, median_residual, residual_noise
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.minimal import MinimalSolver
 from kornia_pnpnet.propose.p3p_rig import P3PRig
@@ -48,6 +48,8 @@ _GROWTH = 0.5
 _FEW_LEFT = 2.0
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
+# Squared ratio of the thresholds to the narrower thresholds of a rival.
+_NARROWER = 16.0
 # Relative damping of a least-squares step. Almost no damping is needed, because the start is close to the minimum.
 _DAMPING = 1e-6
 # Factors of the inlier threshold in the first and in the second least-squares step. The first factor is larger, because
@@ -57,7 +59,7 @@ _LIMITS = 3.0, 1.0
 # drawn. An incorrect pose may then have as many inliers as the correct pose, for example in a flat scene and a narrow
 # field of view. Chosen on a scene with a field of view of 13 degrees. Half of the first number would double the time
 # for problems of 9 pairs.
-_OPEN, _OPEN_SAMPLES = 0.008, 256.0
+_OPEN, _OPEN_SAMPLES = 0.06, 256.0
 # After this number of samples, pairs with a large `agreement_of_neighbours` are drawn more often. Computing the
 # agreement takes about as long as solving this number of samples.
 _PLAIN_SAMPLES = 256
@@ -90,10 +92,12 @@ class Search:
         chances: relative probabilities that pairs are inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; ``None``: estimated from the
             residuals of the inliers.
+        finds_rivals: whether the search finds ``rivals``.
 
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
+        rivals: the best pose of each problem by a quarter of the thresholds, not improved, shape :math:`(B, 12)`.
         scored: number of scored poses, int64, shape :math:`(B,)`.
         drawn: number of drawn samples, int64, shape :math:`(B,)`.
 
@@ -116,7 +120,10 @@ class Search:
         thresholds: Thresholds,
         chances: Tensor | None = None,
         sigma: Tensor | None = None,
+        *,
+        finds_rivals: bool = False,
     ) -> None:
+        self.finds_rivals = finds_rivals
         self.plan, self.problem = plan, problem
         self.chances = torch.ones_like(problem.weights) if chances is None else chances
         self.minimal = plan.minimal
@@ -132,7 +139,9 @@ class Search:
         self.low = self.pairs.to(_DTYPE)
         batch = self.low.shape[0]
         self.poses = torch.eye(3, 4, dtype=_DTYPE, device=self.low.device).flatten().repeat(batch, 1)
+        self.rivals = self.poses
         self.loss = self.low.new_full((batch,), torch.inf)
+        self.rival_loss = self.loss.clone()
         self.needed = self.loss.double()
         self.scored, self.drawn = torch.zeros(2, batch, dtype=torch.int64, device=self.low.device)
 
@@ -158,7 +167,8 @@ class Search:
         active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
         if given is not None and len(active):
             poses = as_entries(given)[active].to(_DTYPE).mT
-            losses = take(self.scene, active).losses(poses, self.plan.score)
+            losses, valid = take(self.scene, active).losses(poses, self.plan.score), torch.ones_like(poses[:, 0]) > 0
+            self._find_rivals(active, take(self.scene, active), poses, valid)
             self.scored[active] += losses.shape[1]
             self.loss[active], best = losses.min(1)
             self.poses[active] = poses.mT[torch.arange(len(best), device=best.device), best]
@@ -249,9 +259,9 @@ class Search:
         if self.samples is not self.plain:
             needed = (needed * self.plain.needed(at, inliers, self.plan.confidence)).sqrt()
         if self.problem.free_focal is None:
-            noise = residual_noise(projection, problem, judged.weights)
-            noise = noise if self.sigma is None else noise._replace(img=self.sigma[rows])
-            is_open = rotation_sigma(projection, problem, noise, judged)[: len(at)] > _OPEN
+            sigma = residual_noise(projection, problem, judged.weights).img if self.sigma is None else self.sigma[rows]
+            precision = (judged.weights > 0) / sigma.square()
+            is_open = pose_sigma(projection, problem, precision)[: len(at)] > _OPEN
             needed = torch.where(is_open, needed.clamp(min=_OPEN_SAMPLES), needed)
         self.needed[at] = needed
 
@@ -273,7 +283,22 @@ class Search:
             width = max(width // _KEPT_ONE_IN, _IMPROVED)
             _, poses, valid = self._best_of(scene.pairs(self.samples.spread(problems, pairs)), poses, valid, width)
             pairs *= _MORE
+        self._find_rivals(problems, scene, poses, valid)
         return self._best_of(scene, poses, valid, _IMPROVED)[:2]
+
+    def _find_rivals(self, problems: Tensor, scene: Scene, poses: Tensor, valid: Tensor) -> None:
+        """Store the poses (P, 12, W) with the smallest losses by narrower thresholds, if the search finds rivals."""
+        if not self.finds_rivals:
+            return
+        losses = scene.losses(poses, self.plan.score, _NARROWER).masked_fill(~valid, torch.inf)
+        loss, best = losses.min(1)
+        better = loss < self.rival_loss[problems]
+        rows, best = problems[better], best[better]
+        self.rivals, self.rival_loss = self.rivals.clone(), self.rival_loss.clone()
+        self.rival_loss[rows], self.rivals[rows] = (
+            loss[better],
+            poses[better].mT[torch.arange(len(best), device=best.device), best],
+        )
 
     def _solved(self, problems: Tensor, positions: Tensor, start: int | None = None) -> tuple[Tensor, Tensor]:
         """Solve samples (P, H, s) of some problems. Returns poses (P, 12, W), and which poses are solutions, (P, W).
@@ -363,7 +388,7 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
     Args:
         sq_residuals: squared residuals, shape (B, N).
         there: which pairs are used, bool, shape (B, N). If a problem uses no pair, its scale is infinite.
-        fitted: see :func:`~kornia_pnpnet.judge.belief.median_residual`.
+        fitted: see :func:`~kornia_pnpnet.judge.inliers.median_residual`.
     """
     median = median_residual(sq_residuals, there, fitted)  # median / (2 log 2) is the variance of a coordinate
     return CAUCHY**2 / (2.0 * math.log(2.0)) * median, there.sum(-1, keepdim=True)

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import solve_symmetric
+from kornia_pnpnet.judge.evidence import copies
 from kornia_pnpnet.problem import Problem
 
 __all__ = ["LEAST_NOISE", "LOG_NOISE", "View", "repeats"]
@@ -22,9 +23,6 @@ LOG_NOISE = -5.0
 LEAST_NOISE = 1e-6
 # Confidences are clipped to at least this number and to at most 1 minus this number.
 _LEAST_CONFIDENCE = 1e-3
-# Points are sorted by a key with these coefficients, so that equal points are adjacent. The ratios of the coefficients
-# are irrational, so that different points of a grid have different keys.
-_KEY = 1.0, 0.7548776662, 0.5698402910
 
 
 class View:
@@ -95,16 +93,8 @@ class View:
 @torch.no_grad()
 def repeats(problem: Problem) -> Tensor:
     """Logarithms (B, N, 2) of the number of pairs with the same pixel, and the number of pairs with the same point."""
-    there = (problem.usual_weights > 0).to(problem.weights).repeat(2, 1)
-    points = torch.cat((functional.pad(problem.img_points, (0, 1)), problem.world_points))  # (2 B, N, 3)
-    order = (points * points.new_tensor(_KEY)).sum(-1).argsort(1)  # equal points are neighbours
-    ordered = points.gather(1, order[..., None].expand_as(points))
-    # `long`, because PyTorch 2.13 cannot compile the maximum of booleans.
-    new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
-    run = functional.pad(new.cumsum(1), (1, 0))
-    sizes = torch.zeros_like(there).scatter_add(1, run, there.gather(1, order))
-    same = torch.empty_like(there).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
-    return same.log().unflatten(0, (2, -1)).movedim(0, -1)
+    there = problem.usual_weights > 0
+    return torch.stack([copies(x, there) for x in (problem.img_points, problem.world_points)], -1).log()
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:

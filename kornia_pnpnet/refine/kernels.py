@@ -43,11 +43,6 @@ class RobustKernel(NamedTuple):
     upper: float
     logarithmic: bool
 
-    @property
-    def bounded(self) -> bool:
-        """Whether weights are at most 1 for every shape."""
-        return bool(self.weight(torch.zeros(()), torch.tensor(self.upper)) <= 1.0)
-
 
 def _power_weight(sq_residual: Tensor, alpha: Tensor) -> Tensor:
     return torch.exp(-0.5 * alpha * torch.log(sq_residual + POWER_FLOOR**2))

@@ -2,45 +2,42 @@ r"""The refinement: stages of robust weighted Levenberg-Marquardt iterations wit
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import ValueCheckError
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative, solve_positive
-from kornia_pnpnet.core.performance import EAGER, Runner, per_problem, problems_last, repeat_problems, sees_values
+from kornia_pnpnet.core.performance import EAGER, Runner, per_problem, problems_last, repeat_problems
+from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.belief import believe, explains, has_enough, has_focal, residual_noise
-from kornia_pnpnet.problem import Noise, Problem, Starts, State
-from kornia_pnpnet.refine.information import (
-    NARROWER,
-    complete_noise,
-    corrected_noise,
-    information,
-    is_unknown,
-    outlier_area,
-    sq_standardised,
-)
+from kornia_pnpnet.judge.belief import believe, has_enough
+from kornia_pnpnet.judge.evidence import Evidence, Mixture, at_pose, evidence, updated, votes
+from kornia_pnpnet.problem import Problem, Starts, State
+from kornia_pnpnet.refine.information import complete_noise, information, is_known, sq_standardised
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
 from kornia_pnpnet.refine.parameters import BoundedParameter
 from kornia_pnpnet.refine.residual import NormalEquations, Projection, lm_step, moved, normal_equations, project
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
-__all__ = ["BACKWARDS", "Plan", "Refinement", "RobustWeightedLM"]
+__all__ = ["BACKWARDS", "Plan", "Progress", "Refinement", "RobustWeightedLM", "taken"]
 
 #: How gradients pass through a refinement, see :class:`RobustWeightedLM`.
 BACKWARDS = ("unroll", "implicit")
+
+_T = TypeVar("_T")
 
 # Focal lengths. Upper bound of a residual in the cost. Points behind the camera have this residual, so that no point in
 # front of the camera costs more than a point behind the camera.
 _MAX_RESIDUAL = 2.0
 # Units in the last place. With `reject_worse`, a step is rejected only if the cost rises by more than this.
 _ROUNDING = 100.0
+# Estimated noise of the points is replaced by 0 only if this raises the log-likelihood by more than this number.
+_EXPECTED = 1.0
 # Factors of the damping after a rejected and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
@@ -59,10 +56,8 @@ class Plan(NamedTuple):
             :math:`(B, N)`. Without iterations by residual, ``by_residual`` equals ``guided``.
         state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second state
             of every problem, and so on.
-        area: :func:`~kornia_pnpnet.refine.information.outlier_area` of problems whose noise is corrected by residuals,
-            0 for all other problems, :math:`(B, 1)`; ``None``: no noise is corrected.
-        noiseless: whether the caller gave no noise for a problem, bool :math:`(B,)`; ``None``: the caller gave no noise
-            for the whole batch, or the initialiser returned noise.
+        known: whether the caller gave the noise of a problem, bool, :math:`(B, 1)`.
+        votes: votes of the pairs, see :func:`~kornia_pnpnet.judge.evidence.votes`, :math:`(B, N)`.
         hyperparameters: step :math:`\gamma`, damping :math:`\lambda` and the kernel's shape of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
     """
@@ -72,18 +67,32 @@ class Plan(NamedTuple):
     guided: Tensor
     by_residual: Tensor
     state: State
-    area: Tensor | None
-    noiseless: Tensor | None
+    known: Tensor
+    votes: Tensor
     hyperparameters: tuple[tuple[Tensor, Tensor, Tensor], ...]
     starts: int
 
 
 class Progress(NamedTuple):
-    """States between two iterations, whether the last equations could be solved (bool), and a factor of the damping."""
+    """What one iteration passes to the next iteration.
+
+    Attributes:
+        state: the states.
+        solved: whether the last equations could be solved, bool, shape :math:`(B,)`.
+        factor: a factor of the damping, shape :math:`(B,)`.
+        mixture: the distribution of the residuals, in iterations by residual.
+    """
 
     state: State
     solved: Tensor
     factor: Tensor
+    mixture: Mixture | None = None
+
+    @classmethod
+    def of(cls, state: State, mixture: Mixture | None = None) -> Progress:
+        """The start of the iterations."""
+        ones = torch.ones_like(state.pose.translation[:, 0])
+        return cls(state, ones > 0, ones, mixture)
 
 
 class Refinement(NamedTuple):
@@ -97,6 +106,8 @@ class Refinement(NamedTuple):
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
         probability: probability that the pose is correct, see :func:`~kornia_pnpnet.judge.belief.probability`, shape
             :math:`(B,)`.
+        sigma: :func:`~kornia_pnpnet.judge.belief.pose_sigma`, float64, shape :math:`(B,)`.
+        evidence: the evidence for the pose.
     """
 
     state: State
@@ -105,6 +116,8 @@ class Refinement(NamedTuple):
     ok: Tensor
     in_front: Tensor
     probability: Tensor
+    sigma: Tensor
+    evidence: Evidence
 
     @property
     def pose(self) -> Pose:
@@ -130,9 +143,10 @@ class RobustWeightedLM(Configured):
     of the last iteration that refined all poses.
 
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
-    weights, because by then the residuals separate inliers from outliers better. If the initialiser estimated the
-    noise, :func:`~kornia_pnpnet.refine.information.corrected_noise` corrects the estimate before these iterations.
-    Noise that the caller gave is not corrected.
+    weights, because by then the residuals separate inliers from outliers better. In these iterations a mixture of
+    inliers and outliers, which is fitted to the residuals, replaces the kernel (see
+    :mod:`kornia_pnpnet.judge.evidence`). The variance of noise that the caller gave changes only if the residuals
+    clearly contradict it.
 
     Problems are independent. A problem that cannot be solved keeps its pose, reports ``ok=False``, and does not change
     other problems.
@@ -150,8 +164,7 @@ class RobustWeightedLM(Configured):
             rejection, iterations from a distant start can diverge. From a good start, rejection takes time but hardly
             changes the steps.
         by_residual: number of final iterations that ignore the initialiser's weights. This number is limited to the
-            iterations after the choice among several poses. The weights of the kernel must be at most 1, which excludes
-            ``power``.
+            iterations after the choice among several poses.
         learnable: whether the hyperparameters are trained.
         backward: how gradients are computed. ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the
             implicit function theorem to the last state. The memory then does not grow with ``m``. The implicit gradient
@@ -160,7 +173,6 @@ class RobustWeightedLM(Configured):
     Raises:
         BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
             out of its bounds.
-        ValueCheckError: for ``by_residual`` with a kernel whose weights exceed 1.
 
     Example:
         >>> from kornia_pnpnet import Normalize
@@ -194,8 +206,6 @@ class RobustWeightedLM(Configured):
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
         self.kernel: RobustKernel = KERNELS[kernel]
-        if by_residual and not self.kernel.bounded:
-            raise ValueCheckError(f"by_residual needs a kernel whose weights are at most 1: not {kernel!r}.")
         self.m = m
         self.explored = 7 * m // 10
         self.by_residual = min(by_residual, m - self.explored)
@@ -258,26 +268,17 @@ class RobustWeightedLM(Configured):
         Returns:
             The refined poses. Weights and cost are computed at these poses with the kernel of the last iteration. A
             pose is ``ok`` only if the equations of the last iteration could be solved and three pairs are in front of
-            the camera. With unknown noise, the pose must explain the pixels better than a single point
-            (:func:`~kornia_pnpnet.judge.belief.explains`). With known noise, the pose must have more inliers than
-            expected by chance (:func:`~kornia_pnpnet.judge.belief.believe`). The pairs must determine an unknown focal
-            length (:func:`~kornia_pnpnet.judge.belief.has_focal`).
+            the camera, and if the evidence suffices (:func:`~kornia_pnpnet.judge.belief.believe`).
         """
-        plan = run(self.begin, problem, starts)
-        state, solved = self.iterate(plan, m, more=more, run=run)
-        return run(self.judge, plan, state, solved)
+        plan, now = self.iterate(run(self.begin, problem, starts), m, more=more, run=run)
+        return run(self.judge, plan, now)
 
     def begin(self, problem: Problem, starts: Starts) -> Plan:
         """Run everything before the first iteration. See :meth:`forward` for the arguments."""
         each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
-        unknown = is_unknown(problem) if self.by_residual or problem.noise is not None else None
-        noiseless = None if unknown is None or problem.noise is None or starts.noise is not None else unknown[:, 0]
+        known = is_known(problem)
         problem = problems_last(problem._replace(noise=complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
-        area = None
-        if self.by_residual and unknown is not None and problem.noise is not None and not problem.noise.covariances:
-            all_known = sees_values(unknown) and unknown.device.type == "cpu" and not bool(unknown.any())
-            area = None if all_known else torch.where(unknown, outlier_area(problem), 0.0)
         # A common factor of the weights does not change a step. The division prevents underflow of products of tiny
         # weights.
         guided = by_residual = relative(prior, prior)
@@ -290,20 +291,19 @@ class RobustWeightedLM(Configured):
         if starts.camera is not None:
             camera = starts.camera.repeat(len(poses), 1)
         weights, state = (prior, guided, by_residual), State(pose, camera)
-        return Plan(problem, *weights, state, area, noiseless, tuple(each), len(poses))
+        return Plan(problem, *weights, state, known, votes(problem), tuple(each), len(poses))
 
-    def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[State, Tensor]:
+    def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[Plan, Progress]:
         """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
 
-        See :meth:`forward` for the arguments. Returns the last state, and whether the last equations could be solved.
+        See :meth:`forward` for the arguments. Returns the plan with the noise of the iterations by residual, and the
+        last states.
         """
         m = self.m if m is None else min(m, self.m)
         each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
         explored = min(self.explored, m) if plan.starts > 1 else 0
-        switch = max(self.m - self.by_residual, explored)
-        guided, by_residual = (plan.problem._replace(weights=x) for x in (plan.guided, plan.by_residual))
-        ones = torch.ones_like(plan.state.pose.translation[:, 0])
-        now, narrower = Progress(plan.state, ones > 0, ones), None
+        switch = max(self.m - self.by_residual, explored) if self.by_residual else len(each)
+        guided, now = plan.problem._replace(weights=plan.guided), Progress.of(plan.state)
         with torch.set_grad_enabled(torch.is_grad_enabled() and self.backward == "unroll"):
             if plan.starts > 1:
                 several = repeat_problems(guided, plan.starts)
@@ -313,52 +313,80 @@ class RobustWeightedLM(Configured):
                 now = run(self._best, rivals, plan.prior, plan.hyperparameters[max(self.explored - 1, 0)][2], now)
             for one in each[explored:switch]:
                 now = run(self._iteration, guided, now, *one)
-            if each[switch:] and plan.area is not None:
-                noise, narrower = run(self._correct, by_residual, now.state, each[switch][2], plan.area, NARROWER)
-                by_residual = by_residual._replace(noise=noise)
-            for step, damping, shape in each[switch:]:
-                shape = shape if narrower is None else shape * narrower
-                now = run(self._iteration, by_residual, now, step, damping, shape)
+            if each[switch:]:
+                plan, now = run(self.shown, plan, now)
+            for step, damping, _ in each[switch:]:
+                now = run(self.by_residuals, plan, now, plan.known, step, damping)
         if self.backward == "implicit" and m and torch.is_grad_enabled():
-            shape = plan.hyperparameters[m - 1][2]
-            return self._with_gradient(
-                by_residual, now.state, shape if narrower is None else shape * narrower
-            ), now.solved
-        return now.state, now.solved
+            now = now._replace(state=self._with_gradient(plan, now, plan.hyperparameters[m - 1][2]))
+        return plan, now
 
-    def judge(self, plan: Plan, state: State, solved: Tensor) -> Refinement:
-        """Run everything after the last iteration: compute weights, cost and ``ok`` of a state of :meth:`iterate`."""
-        projection, shape = project(state, plan.problem), per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
+    def by_residuals(self, plan: Plan, now: Progress, known: Tensor, step: Tensor, damping: Tensor) -> Progress:
+        r"""One iteration by residual: fit the mixture to the residuals, and take a step with its weights.
+
+        Args:
+            plan: the plan.
+            now: the states, with a mixture.
+            known: problems whose mixture keeps its variance, bool, shape :math:`(B, 1)`.
+            step: the step :math:`\gamma`, a scalar.
+            damping: the damping :math:`\lambda`, a scalar.
+        """
+        assert now.mixture is not None
+        problem = plan.problem._replace(weights=plan.by_residual)
+        step, damping = (per_problem(x, plan.prior[:, 0]) for x in (step, damping))
+        projection = project(now.state, problem)
+        sq_residual, density, precision = at_pose(projection, problem)
+        unknowns = 6 + now.state.camera.shape[1]
+        mixture = updated(now.mixture, sq_residual, density, plan.votes, known, unknowns)
+        robust = mixture.weights(sq_residual, density) / mixture.variance
+        equations = self._equations(projection, problem, robust, precision)
+        state, solved = lm_step(equations, now.state, projection.focal, step, damping, additive=self.additive)
+        return Progress(state, solved, now.factor, mixture)
+
+    def judge(self, plan: Plan, now: Progress, found: Evidence | None = None) -> Refinement:
+        """Run everything after the last iteration: compute evidence, weights, cost and ``ok`` of a state.
+
+        Args:
+            plan: the plan that :meth:`iterate` returned.
+            now: the states that :meth:`iterate` returned.
+            found: the evidence for the states, if it is known already.
+        """
+        projection, shape = (
+            project(now.state, plan.problem),
+            per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1]),
+        )
         cost = self._cost(projection, plan.problem, plan.prior, shape)
-        seen, noise = plan.problem._replace(weights=plan.by_residual), plan.problem.noise
-        if plan.area is not None:
-            noise, narrower = corrected_noise(projection, seen, self.kernel.weight, shape, plan.area)
-            shape = shape * narrower
-        sq_residual, _ = information(projection, seen._replace(noise=noise))
-        weights = torch.where(projection.in_front, plan.prior * self.kernel.weight(sq_residual, shape), 0.0)
-        judged, unknown, law = plan.problem._replace(weights=plan.guided), plan.noiseless, "sigmas"
-        if noise is None:
-            noise, judged, law = residual_noise(projection, plan.problem, plan.prior), plan.problem, "residuals"
-            unknown = torch.ones_like(solved)
-        probability, ok = believe(projection, judged, noise, law)
-        if unknown is not None:
-            # ONNX Runtime has no `where` for booleans.
-            ok = (unknown & explains(projection, plan.problem, plan.prior)) | (~unknown & ok)
+        if found is None:
+            found = evidence(projection, plan.problem, plan.votes, plan.known)
+        if now.mixture is None:
+            robust = self.kernel.weight(information(projection, plan.problem)[0], shape)
+        else:
+            robust = found.mixture.weights(*at_pose(projection, plan.problem)[:2])
+        weights = torch.where(projection.in_front, plan.prior * robust, 0.0)
+        probability, ok, sigma = believe(projection, plan.problem, found, plan.known)
         in_front = has_enough(projection, plan.prior)
-        if state.camera.shape[1]:
-            ok = ok & has_focal(projection, judged, noise, weights)
-        return Refinement(state, weights, cost, solved & ok & in_front, in_front, probability)
+        return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
-    def cost(self, plan: Plan, state: State) -> Tensor:
-        """The ``cost`` of :meth:`judge` at any state, shape :math:`(B,)`."""
-        return self._cost(project(state, plan.problem), plan.problem, plan.prior, plan.hyperparameters[-1][2])
+    def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
+        """Fit a mixture to the residuals, and let them choose the noise that an initialiser estimated.
 
-    def _correct(
-        self, problem: Problem, state: State, shape: Tensor, area: Tensor, narrower: float
-    ) -> tuple[Noise, Tensor]:
-        """Correct the noise by the residuals at a state. See :func:`corrected_noise` for the result."""
-        shape = per_problem(shape, problem.weights[:, :1])
-        return corrected_noise(project(state, problem), problem, self.kernel.weight, shape, area, narrower)
+        The noise of the points adds to the noise of the pixels at small depths. If the residuals are likelier without
+        noise of the points, the estimated noise of the points becomes 0.
+        """
+        problem, noise = plan.problem, plan.problem.noise
+        if noise is None or noise.covariances:
+            found = evidence(project(now.state, problem), problem, plan.votes, plan.known)
+            return plan, now._replace(mixture=found.mixture)
+        of_pixels = noise._replace(world=torch.where(plan.known, noise.world, 0.0))
+        both = map_tensors(lambda x, y: torch.cat((x.mT, y.mT), 1).mT, noise, of_pixels)
+        state, problem, votes, known = repeat_problems((now.state, problem, plan.votes, plan.known), 2)
+        found = evidence(project(state, problem), problem._replace(noise=both), votes, known)
+        batch = plan.votes.shape[0]
+        first, second = found.likelihood.view(2, batch)
+        other = (second > first + _EXPECTED).long()
+        index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
+        noise, mixture = taken((both, found.mixture), index)
+        return plan._replace(problem=plan.problem._replace(noise=noise)), now._replace(mixture=mixture)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its state."""
@@ -366,7 +394,7 @@ class RobustWeightedLM(Configured):
         shape = per_problem(shape, problem.weights[:, :1])
         damping = damping * now.factor if self.reject_worse else damping
         projection = project(now.state, problem)
-        equations = self._equations(projection, problem, shape)
+        equations = self._equations(projection, problem, *self._robust(projection, problem, shape))
         state, solved = lm_step(equations, now.state, projection.focal, step, damping, additive=self.additive)
         if not self.reject_worse:
             return Progress(state, solved, now.factor)
@@ -380,10 +408,16 @@ class RobustWeightedLM(Configured):
         kept = map_tensors(lambda x, y: torch.where(better.view(-1, *(1,) * (x.ndim - 1)), x, y), state, now.state)
         return Progress(kept, solved, factor)
 
-    def _equations(self, projection: Projection, problem: Problem, shape: Tensor) -> NormalEquations:
-        """Sum the normal equations of the terms and of the weighted and whitened pairs."""
+    def _robust(self, projection: Projection, problem: Problem, shape: Tensor) -> tuple[Tensor, Tensor | Symmetric2]:
+        """Robust weights (B, N) of the kernel, and the information of the pixels."""
         sq_residual, precision = information(projection, problem)
-        robust = problem.weights * self.kernel.weight(sq_residual, shape)
+        return self.kernel.weight(sq_residual, shape), precision
+
+    def _equations(
+        self, projection: Projection, problem: Problem, robust: Tensor, precision: Tensor | Symmetric2
+    ) -> NormalEquations:
+        """Sum the normal equations of the terms and of the weighted and whitened pairs."""
+        robust = problem.weights * robust
         weights = map_tensors(lambda x: x * robust, precision)
         equations = normal_equations(projection, problem, weights, relative=True)
         for term in problem.terms:
@@ -397,7 +431,7 @@ class RobustWeightedLM(Configured):
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
         best = (cost.view(-1, batch) if batch else cost[None]).argmin(0)  # (B,); at equal costs the first state
         index = torch.add(torch.arange(batch, device=best.device), best, alpha=batch)
-        return map_tensors(lambda x: x.movedim(0, -1).index_select(-1, index).movedim(-1, 0), now)
+        return taken(now, index)
 
     def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
         """Robust loss of pairs and terms, divided by the number of pairs that have a weight, shape (B,)."""
@@ -409,7 +443,7 @@ class RobustWeightedLM(Configured):
             total = total + unit * term.loss(projection.state)
         return total / count
 
-    def _with_gradient(self, problem: Problem, state: State, shape: Tensor) -> State:
+    def _with_gradient(self, plan: Plan, now: Progress, shape: Tensor) -> State:
         r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
 
         Let :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`. At the minimum :math:`g = 0`, so that
@@ -421,8 +455,16 @@ class RobustWeightedLM(Configured):
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
-            return self._equations(project(at, problem), problem, shape)
+            projection = project(at, problem)
+            if mixture is None:
+                return self._equations(projection, problem, *self._robust(projection, problem, shape))
+            sq_residual, density, precision = at_pose(projection, problem)
+            robust = mixture.weights(sq_residual, density) / mixture.variance
+            return self._equations(projection, problem, robust, precision)
 
+        mixture, state = now.mixture, now.state
+        weights = plan.guided if mixture is None else plan.by_residual
+        problem = plan.problem._replace(weights=weights)
         zero = torch.zeros_like(state.pose.translation[:1, 0]).expand(6 + state.camera.shape[1], state.camera.shape[0])
         zero = zero.clone().requires_grad_()
         with torch.enable_grad():
@@ -437,6 +479,15 @@ class RobustWeightedLM(Configured):
             delta = torch.where(convex, newton, torch.where(solved, gauss_newton / focal, 0.0))
             state = moved(state, delta.detach() - delta)
         return state
+
+
+def taken(tree: _T, index: Tensor) -> _T:
+    """Select problems from every tensor of a tree except scalars, in the memory layout of ``problems_last``."""
+
+    def select(x: Tensor) -> Tensor:
+        return x.movedim(0, -1).index_select(-1, index).movedim(-1, 0) if x.ndim else x
+
+    return map_tensors(select, tree)
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:
