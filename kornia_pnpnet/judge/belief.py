@@ -36,7 +36,8 @@ _OPEN = 0.5
 # Largest standard deviation of plausible noise in radians, or 13 pixels at a focal length of 800 pixels. With 0.0125,
 # 4 % of the right poses of indoor RGB-D matches (`rgbd/indoor.npz`, without a ratio test) would not be believed.
 _MOST_NOISE = 0.016
-# A point is off a line if its distance exceeds this share of the standard deviation of the points along the line.
+# A point lies off a line if its distance from the line exceeds this factor times the spread of the points. The spread
+# is the standard deviation of the points along the line.
 _OFF = 0.05
 # With this number of inliers, one point off the line suffices. Each further inlier requires a further point, up to 3.
 _FEW = 5

@@ -42,8 +42,9 @@ _LEAST_ANGLE, _STEP, _SCALES = 1e-4, 8.0, 6
 _UNEXPECTED = -3.0
 # Rounds of expectation and maximisation: for the share of inliers at each factor, and for the final factor and share.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
-# Real residuals have heavy tails. This share of the inliers therefore has residuals of this factor of the variance.
-# Without these inliers, success on indoor RGB-D matches falls by 2.5 points.
+# Real residuals have heavy tails. The model therefore has a second kind of inliers: the first number is their share of
+# all inliers, and the second number is the factor of their variance. With one kind of inliers, success on indoor RGB-D
+# matches falls by 2.5 points.
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3

@@ -55,10 +55,9 @@ _DAMPING = 1e-6
 # Factors of the inlier threshold in the first and in the second least-squares step. The first factor is larger, because
 # inliers have larger residuals at the pose of a minimal sample than at an improved pose.
 _LIMITS = 3.0, 1.0
-# If the standard deviation of the rotation exceeds the first number (radians), at least the second number of samples is
-# drawn. An incorrect pose may then have as many inliers as the correct pose, for example in a flat scene and a narrow
-# field of view. Chosen on a scene with a field of view of 13 degrees. Half of the first number would double the time
-# for problems of 9 pairs.
+# If `pose_sigma` exceeds the first number, at least the second number of samples is drawn. An incorrect pose may then
+# have as many inliers as the correct pose, for example in a flat scene and a narrow field of view. The first number
+# corresponds to a standard deviation of the rotation of 0.6 degrees, or less if the translation is uncertain, too.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
 # After this number of samples, pairs with a large `agreement_of_neighbours` are drawn more often. Computing the
 # agreement takes about as long as solving this number of samples.
@@ -139,7 +138,7 @@ class Search:
         self.low = self.pairs.to(_DTYPE)
         batch = self.low.shape[0]
         self.poses = torch.eye(3, 4, dtype=_DTYPE, device=self.low.device).flatten().repeat(batch, 1)
-        self.rivals = self.poses
+        self.rivals = self.poses.clone()
         self.loss = self.low.new_full((batch,), torch.inf)
         self.rival_loss = self.loss.clone()
         self.needed = self.loss.double()
@@ -167,8 +166,9 @@ class Search:
         active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
         if given is not None and len(active):
             poses = as_entries(given)[active].to(_DTYPE).mT
-            losses, valid = take(self.scene, active).losses(poses, self.plan.score), torch.ones_like(poses[:, 0]) > 0
-            self._find_rivals(active, take(self.scene, active), poses, valid)
+            scene = take(self.scene, active)
+            losses = scene.losses(poses, self.plan.score)
+            self._find_rivals(active, scene, poses, torch.ones_like(losses) > 0)
             self.scored[active] += losses.shape[1]
             self.loss[active], best = losses.min(1)
             self.poses[active] = poses.mT[torch.arange(len(best), device=best.device), best]
@@ -294,11 +294,8 @@ class Search:
         loss, best = losses.min(1)
         better = loss < self.rival_loss[problems]
         rows, best = problems[better], best[better]
-        self.rivals, self.rival_loss = self.rivals.clone(), self.rival_loss.clone()
-        self.rival_loss[rows], self.rivals[rows] = (
-            loss[better],
-            poses[better].mT[torch.arange(len(best), device=best.device), best],
-        )
+        self.rival_loss[rows] = loss[better]
+        self.rivals[rows] = poses[better].mT[torch.arange(len(best), device=best.device), best]
 
     def _solved(self, problems: Tensor, positions: Tensor, start: int | None = None) -> tuple[Tensor, Tensor]:
         """Solve samples (P, H, s) of some problems. Returns poses (P, 12, W), and which poses are solutions, (P, W).
