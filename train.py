@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from kornia.core.exceptions import ValueCheckError
@@ -39,7 +41,14 @@ def main(config: DictConfig) -> float | None:
     folder = Path(runtime.runtime.output_dir)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    fabric = instantiate(config.engine)
+    try:
+        fabric = instantiate(config.engine)
+    except InstantiationException as error:
+        sys.exit(
+            f"Cannot start engine.accelerator={config.engine.accelerator} engine.devices={config.engine.devices}: "
+            f"{error.__cause__} PyTorch {torch.__version__} sees {torch.cuda.device_count()} CUDA devices. "
+            "Install PyTorch for your GPU, or pass engine=cpu."
+        )
     fabric.launch()
     torch.manual_seed(config.seed)
     model = instantiate(config.model.solver)
@@ -88,7 +97,9 @@ def main(config: DictConfig) -> float | None:
         return None
     log.info("%s", report)
     if report.interrupted:
-        log.warning("Stopped at update %s of %s; continue with resume=true.", report.update, settings.updates)
+        sweep = [f"hydra.sweep.dir={runtime.sweep.dir}"] if sweeps else []
+        again = continuing(*sweep, "resume=true")
+        log.warning("Stopped at update %s of %s. Continue with: %s", report.update, settings.updates, again)
         sys.exit(130)
     if report.start == report.update and (folder / RESULTS_NAME).exists():
         log.info("Nothing is left to train; the results stay as they are.")
@@ -99,16 +110,25 @@ def main(config: DictConfig) -> float | None:
                 raise
             sys.exit(str(error))
     else:
+        log.info("Measuring success and speed of the trained solver")
         results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task), origin)
         write_json(folder / RESULTS_NAME, to_json(results))
         model.save_pretrained(folder / "weights")
         write_model_card(folder / "weights", results)
     for name, entry in results.validation.items():
-        log.info("%s: success %s", name, entry.success)
+        log.info(
+            "%s (%s): success %s", name, config.data.get("about", {}).get(name, "see the configuration"), entry.success
+        )
     log.info("Weights, model card and results are in %s", folder)
     if sweeps:
-        log.info("Sweep summary: %s", summarize_runs(runtime.sweep.dir))
+        summarize_runs(runtime.sweep.dir)
     return results.validation.get("uniform", entry).success.rate
+
+
+def continuing(*more: str) -> str:
+    """The command that continues this run, or all runs of the sweep. Jobs of a cluster do not know their sweep."""
+    words = sys.argv if Path(sys.argv[0]).name == Path(__file__).name else ["train.py", "-m", "..."]
+    return shlex.join(["python", *words, *(word for word in more if word not in words)])
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:

@@ -182,6 +182,7 @@ class Ours(Contender):
         self.solver: nn.Module = solver.float().to(device)
         self.device = device
         self.n = int(found[1]) if (found := re.match(r"pnpnet-n(\d+)", spec)) else None
+        self.solver.requires_grad_(spec.startswith("pnpnet-"))
         if compiled:
             compile_or_raise(self.solver, **options)
 

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ import torch
 from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw, first
 from harness import HERE, in_turns, parser, say, share, summary
 from timing import BACKWARD, FORWARD
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
@@ -98,7 +98,7 @@ def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype)
     """Result, gradient of the poses to points and pixels, (B, 5 N), both on the CPU, and the rate of success."""
     world, img, intrinsics = (x.to(device, dtype, copy=True) for x in problems[:3])
     leaves = [world.requires_grad_(), img.requires_grad_()]
-    result = solver.to(device, dtype)(*leaves, intrinsics)
+    result = solver.to(device, dtype)(world, img, intrinsics)
     parts = contenders.gradient(result.pose, leaves) if result.rotation.requires_grad else (None, None)
     filled = [torch.zeros_like(leaf) if part is None else part for part, leaf in zip(parts, leaves, strict=True)]
     rotation, translation = (x.detach().cpu() for x in result.pose)
@@ -155,13 +155,13 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             if (options := MODES[mode]) is not None:
                 contenders.compile_or_raise(solver, **options)
         for batch in amount.calls:
-            modes = _modes(solvers, batch, device, amount.rounds)  # type: ignore[arg-type]
+            modes = _modes(solvers, batch, device, amount.rounds)
             yield {"solver": name, "batch": batch, "modes": modes}
             for mode in [mode for mode, found in modes.items() if "why" in found]:
                 del solvers[mode]  # a solver that has failed to compile runs uncompiled from now on
 
 
-def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> dict[str, dict[str, Any]]:
+def _modes(solvers: Mapping[str, nn.Module], batch: int, device: str, rounds: int) -> dict[str, dict[str, Any]]:
     """Time a call of each mode in turns, and compare its result with that of the first mode."""
     problems = draw(N, batch)
     inputs = contenders.float_inputs(problems, device)
@@ -171,7 +171,7 @@ def _modes(solvers: dict[str, PnPNet], batch: int, device: str, rounds: int) -> 
     for mode, solver in solvers.items():
         say(f"graphs: B = {batch}, {mode}")
         try:
-            call: Callable[[], PnPResult] = torch.no_grad()(partial(solver, *inputs))
+            call: Callable[[], PnPResult] = torch.no_grad()(partial(solver, inputs[0], inputs[1], inputs[2]))
             task = _task(captured(call) if mode == "captured" else call, problems, device)
             start = time.perf_counter()
             task.warm()

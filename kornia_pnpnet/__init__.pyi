@@ -1,6 +1,7 @@
 """What type checkers see, and what :mod:`kornia_pnpnet` imports at the first use of each name."""
 
 from .covariance import pose_covariance as pose_covariance
+from .diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
 from .frame import Normalize as Normalize
 from .likelihood import monte_carlo_pose_loss as monte_carlo_pose_loss
 from .losses import PoseLoss as PoseLoss, SetLoss as SetLoss

@@ -10,9 +10,10 @@ from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kornia_pnpnet.cameras import bearing_cameras, check_coefficients, pinholes, undistort
+from kornia_pnpnet.cameras import bearing_cameras, check_coefficients, focal_length, pinholes, undistort
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
-from kornia_pnpnet.core.performance import present_first, sees_values
+from kornia_pnpnet.core.linalg import nearest_rotation
+from kornia_pnpnet.core.performance import in_full_precision, present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.problem import MIN_PAIRS, Noise
@@ -181,12 +182,24 @@ def checked_inputs(
     init, rig = (None if pose is None else Pose(*pose) for pose in (init, cam_from_rig))
     inputs = Inputs(world_points, img_points, cameras, weights, mask, init, noise, confidence, prior, rig)
     inputs = map_tensors(lambda x: one_batch(x, size, dtype), inputs)
+    if inputs.init is not None:
+        inputs = inputs._replace(init=_with_rotation(inputs.init))
+    if inputs.prior is not None:
+        inputs = inputs._replace(prior=inputs.prior._replace(pose=_with_rotation(inputs.prior.pose)))
     dist, fisheye = (
         None if x is None else one_batch(x.expand(*size, x.shape[-1]), size, dtype) for x in (dist, fisheye)
     )
     if is_bearing:
         return size, _looking_along(inputs)
     return size, inputs if dist is None and fisheye is None else with_undistorted(inputs, dist, fisheye)
+
+
+def _with_rotation(pose: Pose) -> Pose:
+    """Replace each matrix by the nearest rotation, or by NaN if its determinant is not positive."""
+    with in_full_precision(pose.rotation.device.type):
+        rotation, unique = nearest_rotation(pose.rotation.permute(1, 2, 0))
+        usable = unique & (torch.linalg.det(pose.rotation.detach()) > 0)
+    return Pose(torch.where(usable[:, None, None], rotation.permute(2, 0, 1), torch.nan), pose.translation)
 
 
 def checked_noise(
@@ -222,12 +235,8 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
     Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay: ``Normalize`` refuses their problem.
     """
     broken = ~inputs.img_points.isfinite().all(-1)
-    # The identity replaces invalid cameras, so that gradients are finite. `Normalize` later refuses these problems.
-    diagonal = inputs.intrinsics.diagonal(dim1=-2, dim2=-1)
-    usable = inputs.intrinsics.isfinite().flatten(-2).all(-1) & (diagonal / diagonal[..., 2:] > 0).all(-1)
-    camera = torch.where(usable[..., None, None], inputs.intrinsics, torch.eye(3).to(diagonal))
     seen = torch.where(broken[..., None], 0.0, inputs.img_points)
-    pixels, found, noise = undistort(seen, camera, dist, fisheye, inputs.noise)
+    pixels, found, noise = undistort(seen, inputs.intrinsics, dist, fisheye, inputs.noise)
     mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
     return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
 
@@ -238,7 +247,7 @@ def _looking_along(inputs: Inputs) -> Inputs:
     axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
     # The geometric mean of fx and fy converts sigmas from pixels to radians. Skew and principal point are ignored.
     cameras, has_focal = pinholes(inputs.intrinsics.diagonal(dim1=-2, dim2=-1).diag_embed())
-    focal = torch.where(has_focal, (cameras[..., 0, 0] * cameras[..., 1, 1]).sqrt(), 0.0)
+    focal = torch.where(has_focal, focal_length(cameras), 0.0)
     cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
     rig = Pose(rotation, torch.zeros_like(rotation[..., 0]))
     if inputs.rig is not None:
@@ -328,7 +337,6 @@ def joined(parts: list[Part], results: list[PnPResult]) -> PnPResult:
     padded = []
     for part, result in zip(parts, results, strict=True):
         if part.pairs is not None:
-            assert result.inliers is not None
             none = result.weights.new_zeros(len(part.pairs), part.most_pairs)
             weights = none.scatter(1, part.pairs, result.weights)
             result = result._replace(weights=weights, inliers=(none > 0).scatter(1, part.pairs, result.inliers))

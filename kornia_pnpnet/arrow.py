@@ -13,14 +13,13 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from torch import Tensor, nn
 
+from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.registry import create_solver
 from kornia_pnpnet.result import Status
 
-try:
+with needs("shards", "tables need pyarrow"):
     import pyarrow as pa
     from pyarrow import compute
-except ImportError as error:
-    raise ImportError("tables need one more package: pip install 'kornia_pnpnet[shards]'") from error
 
 __all__ = ["INPUTS", "OUTPUTS", "Solve", "list_column"]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ShapeError, ValueCheckError
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.conversions import convert_points_to_homogeneous, normalize_points_with_intrinsics
@@ -12,9 +13,10 @@ from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from kornia_pnpnet.core.checks import check_devices, check_shapes, common_dtype
 from kornia_pnpnet.problem import Noise
 
-__all__ = ["bearing_cameras", "bearings", "check_coefficients", "pinholes", "undistort"]
+__all__ = ["bearing_cameras", "bearings", "check_coefficients", "focal_length", "pinholes", "undistort"]
 
 # Numbers of distortion coefficients that Kornia and OpenCV accept.
 _COEFFICIENTS = (4, 5, 8, 12, 14)
@@ -50,6 +52,7 @@ def undistort(
         principal point then replaces the pixel. The standard deviation of isotropic noise is multiplied by the root
         mean square of the singular values of the undistortion's Jacobian, so that the noise stays isotropic.
     """
+    KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
     camera, _ = pinholes(intrinsics)
     point, found, lens = _through(dist, fisheye, img_points, intrinsics)
     flatten = (lambda x: x) if fisheye is None else _flatten
@@ -60,7 +63,8 @@ def undistort(
     if noise is not None:
         with torch.no_grad():  # derivative of the undistorted with respect to the distorted point
             jacobian = _jacobian(flatten, point) @ _inverse(_jacobian(lens, point))
-            jacobian = torch.where(found[..., None, None], jacobian, torch.eye(2).to(jacobian))
+            eye = torch.eye(2, dtype=jacobian.dtype, device=jacobian.device)
+            jacobian = torch.where(found[..., None, None], jacobian, eye)
         to_pixels = camera[:, None, :2, :2]
         jacobian = to_pixels @ jacobian @ torch.linalg.inv(to_pixels)
         noise = noise._replace(img=noise.img * (0.5 * jacobian.square().sum((-1, -2))).sqrt())
@@ -78,7 +82,7 @@ def bearings(
     Bearings of a fisheye may be more than 90 degrees off the optical axis.
 
     Args:
-        img_points: shape :math:`(B, N, 2)`.
+        img_points: shape :math:`(B, N, 2)`; :math:`B` stands for any number of leading dimensions, also for none.
         intrinsics: shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
         dist: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         fisheye: see ``PnPNet.forward``.
@@ -88,8 +92,9 @@ def bearings(
         bearing of a pixel that cannot be undistorted is NaN and has no gradient.
 
     Raises:
-        ShapeError: for a number of coefficients that no lens model has.
+        ShapeError: for other shapes, and for a number of coefficients that no lens model has.
         ValueCheckError: when both ``dist`` and ``fisheye`` are given.
+        BaseError: for tensors on different devices, and for booleans or complex numbers.
 
     Example:
         >>> camera = torch.tensor([[100.0, 0.0, 320.0], [0.0, 100.0, 240.0], [0.0, 0.0, 1.0]])
@@ -98,9 +103,17 @@ def bearings(
         tensor([[[ 0.7071,  0.0000, -0.7071]]])
     """
     check_coefficients(dist, fisheye)
-    batch = len(img_points)
-    dist, fisheye = (None if x is None else x.expand(batch, x.shape[-1]) for x in (dist, fisheye))
-    point, found, _ = _through(dist, fisheye, img_points, intrinsics.expand(batch, 3, 3))
+    KORNIA_CHECK_SHAPE(img_points, ["*", "N", "2"])
+    size, tensors = img_points.shape[:-2], {"intrinsics": intrinsics, "dist": dist, "fisheye": fisheye}
+    given = {name: x for name, x in tensors.items() if x is not None}
+    entries = {name: (3, 3) if name == "intrinsics" else (x.shape[-1],) for name, x in given.items()}
+    check_shapes({name: (x, (*size[: x.ndim - len(entries[name])], *entries[name])) for name, x in given.items()})
+    check_devices(given, img_points, "img_points")
+    dtype = common_dtype({"img_points": img_points, **given})
+    pixels = img_points.to(dtype).reshape(size.numel(), *img_points.shape[-2:])
+    for name, x in given.items():
+        given[name] = x.to(dtype).expand(*size, *entries[name]).reshape(-1, *entries[name])
+    point, found, _ = _through(given.get("dist"), given.get("fisheye"), pixels, given["intrinsics"])
     if fisheye is None:
         rays = normalize(convert_points_to_homogeneous(point), dim=-1)
     else:
@@ -108,7 +121,7 @@ def bearings(
         found = found & (angle.detach()[..., 0] < torch.pi)
         sine, cosine = torch.where(is_central, 1.0, angle.sin() / angle), torch.where(is_central, 1.0, angle.cos())
         rays = torch.cat((sine * point, cosine), -1)
-    return torch.where(found[..., None], rays, torch.nan)
+    return torch.where(found[..., None], rays, torch.nan).reshape(*img_points.shape[:-1], 3)
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
@@ -139,6 +152,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
         >>> (rotation @ torch.tensor([3.0, 0.0, -4.0]))[..., 2]
         tensor([[5.]])
     """
+    KORNIA_CHECK_SHAPE(rays, ["*", "3"])
     length = rays.detach().norm(dim=-1, keepdim=True)
     sound = (length > 0) & length.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
@@ -154,14 +168,19 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Scale camera matrices (*, 3, 3) to a last entry of 1, and tell which matrices are valid, bool (*).
 
-    A valid matrix has finite entries and positive focal lengths. An invalid matrix becomes the identity, without
+    A valid matrix has finite entries, and focal lengths that are not 0. An invalid matrix becomes the identity, without
     gradient.
     """
     scaled = intrinsics.detach() / intrinsics.detach()[..., 2:, 2:]
-    sound = scaled.isfinite().all(-1).all(-1) & (scaled.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
+    sound = scaled.isfinite().all(-1).all(-1) & (scaled.diagonal(dim1=-2, dim2=-1) != 0).all(-1)
     eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
     safe = torch.where(sound[..., None, None], intrinsics, eye)
     return safe / safe[..., 2:, 2:], sound
+
+
+def focal_length(camera: Tensor) -> Tensor:
+    """Geometric mean of the absolute values of fx and fy of valid camera matrices (*, 3, 3), shape (*)."""
+    return (camera[..., 0, 0] * camera[..., 1, 1]).abs().sqrt()
 
 
 def _through(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
@@ -23,6 +25,9 @@ __all__ = ["pose_covariance"]
 # Least eigenvalue of a regular information matrix with a unit diagonal. Smaller eigenvalues are rounding errors of
 # float64.
 _LEAST_EIGENVALUE = 1e-13
+# Largest ratio of an estimated focal length to the focal length that the pixels show. A larger ratio is no estimate,
+# but the initial value of the solver's call.
+_FOCAL_RATIO = 1.5
 
 
 def pose_covariance(
@@ -64,19 +69,19 @@ def pose_covariance(
             given.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
-        weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as the ``weights`` of a result. For
-            ``p3p-ransac`` with a ``world_threshold`` pass ``(result.weights > 0).double()``, because the weights also
-            depend on the depth. ``None``: 1 for every pair.
+        weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as ``result.inliers.double()``.
+            ``None``: 1 for every pair.
         prior: the prior of the solver's call. Its information is added to the information of the pairs.
         focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
-            ``intrinsics`` of the result.
+            ``intrinsics`` of the result, not those of the solver's call.
         focal_sigma: the solver's ``focal_sigma``. Its information is added to the information of the pairs.
 
     Returns:
         Shape :math:`(B, 6, 6)` in radians and the unit of the world. The dtype is the dtype of a solver's result. With
         an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the logarithm of
         the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is
-        infinite and all other entries are 0.
+        infinite and all other entries are 0. The same holds if ``focal`` is ``"unknown"`` and the focal length of the
+        intrinsics is wrong by a factor of 1.5: at the pose, the pixels then show another focal length.
 
     Raises:
         BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` has another value,
@@ -112,13 +117,18 @@ def pose_covariance(
     projection, inlier = project(state, problem), _inlier_probability(problem.weights)
     precision = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, problem.noise))
     equations, determined = normal_equations(projection, problem, precision), frame.valid
+    if size_of_camera:
+        plane, pixels = projection.plane, problem.img_points.permute(2, 1, 0) / problem.focal
+        ratio = (plane * pixels).sum(0) / plane.square().sum(0)  # (N, B); NaN behind the camera
+        ratio = torch.where(problem.weights.mT > 0, ratio, torch.nan).detach().nanmedian(0).values
+        determined = determined & (ratio.log().abs() < math.log(_FOCAL_RATIO))
     if focal_sigma is not None:
         check_positive(focal_sigma=focal_sigma)
-        one = torch.ones_like(frame.scale)
+        one = torch.ones_like(frame.size)
         term = CameraTerm(one, one * focal_sigma**-2, one, one)
         equations = add_term(equations, term.linearise(state), problem.focal)
     if inputs.prior is not None:
-        framed, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.scale)
+        framed, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
         equations, determined = add_term(equations, framed.linearise(state), problem.focal), determined & usable
     information = equations.matrix.permute(2, 0, 1) * problem.focal.square()
     eye = torch.eye(information.shape[-1], dtype=information.dtype, device=information.device)
@@ -129,15 +139,15 @@ def pose_covariance(
         determined = (determined & is_definite & correlation.isfinite().all((1, 2)))[:, None, None]
     inverse = torch.linalg.inv_ex(torch.where(determined, information, eye)).inverse
 
-    # Back to the caller's world: omega does not change, v = v_framed / scale + (R centroid) x omega.
+    # Back to the caller's world: omega does not change, v = size v_framed + (R centroid) x omega.
     rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
     back = eye.repeat(len(information), 1, 1)
     back[:, 3:6, :3] = So3.hat(rotated_centroid)
-    back[:, 3:6, 3:6] /= frame.scale[:, None, None]
+    back[:, 3:6, 3:6] *= frame.size[:, None, None]
     if size_of_camera:  # the depth of the centroid grows with the focal length, see `refine.residual.moved`
         back[:, 5, 6] = pose.translation[:, 2] + rotated_centroid[:, 2]
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
-    covariance = torch.where(determined, covariance, torch.where(eye > 0, torch.inf, 0.0))
+    covariance = torch.where(determined, covariance, eye.masked_fill(eye > 0, torch.inf))
     return restore_leading(size, covariance.to(dtype))
 
 

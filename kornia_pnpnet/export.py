@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import io
 import warnings
 from pathlib import Path
@@ -13,6 +14,7 @@ from kornia.core.exceptions import ValueCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_shapes, check_whole
+from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.performance import INLINE, package_options
 from kornia_pnpnet.data import CameraProblems
@@ -27,6 +29,7 @@ __all__ = [
     "ExportedCamera",
     "ExportedResult",
     "PackagedSolver",
+    "check_packages",
     "export_onnx",
     "export_package",
     "export_program",
@@ -162,6 +165,28 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split())[:300]
 
 
+def check_packages(suffix: str) -> None:
+    """Check that everything is installed that an export to a file ``.onnx`` or ``.pt2`` needs.
+
+    Raises:
+        ImportError: when the extra ``onnx`` or, for ``.pt2``, a C++ compiler is not installed.
+    """
+    if suffix == ".onnx":
+        with needs("onnx", "ONNX models need more packages"):
+            for name in ("onnx", "onnx_ir", "onnxscript"):
+                importlib.import_module(name)
+        return
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
+    try:
+        get_cpp_compiler()
+    except RuntimeError as error:
+        raise ImportError(
+            "Ahead-of-time packages need a C++ compiler: install g++ (Debian, Ubuntu: apt install g++) or clang, or"
+            " name yours in the environment variable CXX"
+        ) from error
+
+
 def export_package(
     solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
 ) -> Path:
@@ -191,15 +216,7 @@ def export_package(
     path = Path(path)
     if path.suffix != ".pt2":
         raise ValueCheckError(f"The name of a package must end in .pt2, got '{path}'.")
-    from torch._inductor.cpp_builder import get_cpp_compiler
-
-    try:
-        get_cpp_compiler()
-    except RuntimeError as error:
-        raise ImportError(
-            "Ahead-of-time packages need a C++ compiler: install g++ (Debian, Ubuntu: apt install g++) or clang, or"
-            " name yours in the environment variable CXX"
-        ) from error
+    check_packages(".pt2")
     program = export_program(solver, n, batch=batch, rig=rig)
     pairs = _fixed_n(solver, n)
     metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}
@@ -253,7 +270,7 @@ class PackagedSolver:
             raise ValueCheckError(f"This package {'needs' if self.rig else 'does not take'} cam_from_rig.")
         batch, n = (*world_points.shape, 0, 0)[:2]
         batch, n = self.batch or batch, self.n or max(n, 4)
-        weights = torch.ones(batch, n) if weights is None else weights
+        weights = world_points.new_ones(batch, n) if weights is None else weights
         cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
         intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
@@ -296,10 +313,7 @@ def export_onnx(
     Raises:
         ImportError: when the extra ``onnx`` is not installed.
     """
-    try:
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ImportError("ONNX needs more packages: pip install 'kornia_pnpnet[onnx]'") from error
+    check_packages(".onnx")
     path = Path(path)
     program = export_program(solver, n, batch=batch, rig=rig)
     inputs, outputs = RIG_INPUTS if rig else INPUTS, OUTPUTS if solver.focal == "known" else ExportedCamera._fields

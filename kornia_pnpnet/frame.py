@@ -16,7 +16,7 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import span_a_plane
-from kornia_pnpnet.core.performance import ascending_order, ranked
+from kornia_pnpnet.core.performance import ascending_order, exporting, ranked
 from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
@@ -32,6 +32,8 @@ F_CONST = 3400.0
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
 # Typical distances from the median. Points further away lose their weight, because float32 has too few digits.
 _LARGEST_DISTANCE = 1e6
+# Confidences outside of [0, 1] by less than this number are rounded probabilities, such as cosines of descriptors.
+_ROUNDING = 1e-3
 # Tangent of 85 degrees. No real lens without distortion shows larger angles from the axis.
 _FAR_ANGLE = 11.4
 
@@ -41,23 +43,27 @@ class Frame(NamedTuple):
 
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
-        scale: factor of world lengths, shape :math:`(B,)`.
-        img_scale: factor of pixels: the geometric mean of the factors of u and v, shape :math:`(B,)`. In a rig, the
-            factor is the mean over the pairs.
+        size: the length in the caller's world that became 1, shape :math:`(B,)`.
+        img_scale: factor of pixels: the geometric mean of the absolute factors of u and v, shape :math:`(B,)`. In a
+            rig, the factor is the mean over the pairs.
         order: for each normalised pair, its position in the input, int64, shape :math:`(B, N)`. ``None``: the same
             order.
         status: ``Status.SOLVED`` for a valid problem, else the reason why the problem is invalid, int64, shape
             :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
             :math:`(B, N, 3, 3)`. The identity replaces invalid matrices.
+        ignored: the status of a valid problem that is not ``ok``, if the confidence of a pair or the initial pose was
+            invalid and ignored: ``Status.CONFIDENCE`` or ``Status.INIT``, else ``Status.SOLVED``, int64, shape
+            :math:`(B,)`. ``None``: the caller gave neither.
     """
 
     centroid: Tensor
-    scale: Tensor
+    size: Tensor
     img_scale: Tensor
     order: Tensor | None
     status: Tensor
     intrinsics: Tensor
+    ignored: Tensor | None = None
 
     @property
     def valid(self) -> Tensor:
@@ -65,18 +71,18 @@ class Frame(NamedTuple):
         return self.status == Status.SOLVED.value
 
     def apply(self, pose: Pose) -> Pose:
-        r"""Express a pose in the frame of the problem: :math:`(R,\; s (t + R c))` with scale s and centroid c."""
+        r"""Express a pose in the frame of the problem: :math:`(R,\; (t + R c) / s)` with size s and centroid c."""
         offset = (pose.rotation * self.centroid[:, None]).sum(-1)
-        return Pose(pose.rotation, (pose.translation + offset) * self.scale[:, None])
+        return Pose(pose.rotation, (pose.translation + offset) / self.size[:, None])
 
     def undo(self, pose: Pose) -> Pose:
-        r"""Express a pose in the caller's world, the inverse of :meth:`apply`: :math:`(R,\; t / s - R c)`.
+        r"""Express a pose in the caller's world, the inverse of :meth:`apply`: :math:`(R,\; s t - R c)`.
 
         Each problem may have several poses, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
         """
         more = (1,) * (pose.translation.ndim - 2)
         offset = (pose.rotation * self.centroid.view(-1, *more, 1, 3)).sum(-1)
-        return Pose(pose.rotation, pose.translation / self.scale.view(-1, *more, 1) - offset)
+        return Pose(pose.rotation, pose.translation * self.size.view(-1, *more, 1) - offset)
 
     def undo_pairs(self, values: Tensor) -> Tensor:
         """Sort values of pairs, :math:`(B, N)`, back to the caller's order."""
@@ -86,18 +92,22 @@ class Frame(NamedTuple):
         """Express starts in the caller's frame, order and units. The new ``ok`` is :attr:`valid`."""
         noise = starts.noise
         if noise is not None:
-            noise = Noise(noise.img / self.img_scale[:, None], noise.world / self.scale[:, None])
+            noise = Noise(noise.img / self.img_scale[:, None], noise.world * self.size[:, None])
             noise = map_tensors(self.undo_pairs, noise)
         others = None if starts.others is None else self.undo(starts.others)
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
 
-    def start(self, init: Pose | None) -> Pose:
-        """Express the caller's pose in the frame of the problem. ``None`` and non-finite poses become the identity."""
-        eye = torch.eye(3, dtype=self.scale.dtype, device=self.scale.device).expand(self.scale.shape[0], 3, 3)
+    def start(self, init: Pose | None) -> tuple[Pose, Tensor]:
+        """Express the caller's pose in the frame of the problem, and tell which poses are finite, bool (B,).
+
+        ``None`` and non-finite poses become the identity.
+        """
+        eye = torch.eye(3, dtype=self.size.dtype, device=self.size.device).expand(self.size.shape[0], 3, 3)
         init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
         limit = torch.finfo(eye.dtype).max ** 0.25  # fourth powers of numbers below this limit are finite
-        usable = self.valid & (torch.cat((init.rotation.flatten(1), init.translation), 1).abs().amax(-1) < limit)
-        return self.apply(gate_pose(init, usable, usable))
+        values = torch.cat((init.rotation.flatten(1), init.translation / self.size[:, None]), 1)
+        usable = self.valid & (values.abs().amax(-1) < limit)
+        return self.apply(gate_pose(init, usable, usable)), usable
 
 
 class Normalize(Configured):
@@ -105,8 +115,8 @@ class Normalize(Configured):
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
     with or without skew). At least three of its pairs have a positive weight, and its points do not coincide or lie on
-    one line. The inputs of invalid problems are replaced by zeros, so that all later values and gradients are finite. A
-    pair of weight 0 is padding. The coordinates of padding are ignored.
+    one line, even if each coordinate changes by rounding. The inputs of invalid problems are replaced by zeros, so that
+    all later values and gradients are finite. A pair of weight 0 is padding. The coordinates of padding are ignored.
 
     Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
     the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
@@ -166,14 +176,21 @@ class Normalize(Configured):
             noise: standard deviations in pixels and in the unit of the world, NaN where unknown; covariances in the
                 squares of these units.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN where
-                unknown.
+                unknown. Pairs with another confidence are left out.
             rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
 
         Returns:
             The normalised problem, and the :class:`Frame` that undoes the normalisation. In memory, the batch is the
             last dimension of the problem.
         """
-        batch, count = world_points.shape[:2]
+        (batch, count), left_out = world_points.shape[:2], None
+        if confidence is not None:
+            named = torch.ones_like(confidence, dtype=torch.bool) if mask is None else mask
+            named = named if weights is None else named & (weights != 0)
+            is_probability = (confidence > -_ROUNDING) & (confidence < 1.0 + _ROUNDING)
+            mask = named & (is_probability | confidence.isnan())
+            left_out = named & ~mask
+            confidence = torch.where(mask, confidence.clamp(0.0, 1.0), torch.nan)
         padded = weights is not None or mask is not None
         if weights is None:
             weights = world_points.new_ones(batch, count) if mask is None else mask.to(world_points.dtype)
@@ -189,71 +206,72 @@ class Normalize(Configured):
         camera = cameras[:, None] if intrinsics.ndim == 3 else cameras  # (9, 1 or N, B)
 
         # Fourth powers of numbers between `limit` and its inverse neither overflow nor underflow. NaN compares false.
-        limit = torch.finfo(rows.dtype).max ** 0.25
-        there = rows[5] != 0
+        limits = torch.finfo(rows.dtype)
+        limit = limits.max**0.25
+        given = rows[5] != 0
         sizes = rows.detach().abs()
         if padded:
-            sizes = torch.where(there, sizes, zero)
-        size = sizes[:5].amax(0)  # largest coordinate of each pair
-        # The sum is tested, because the maximum of ONNX Runtime ignores NaN.
-        is_finite = sizes.sum((0, 1)) < torch.inf
+            sizes = torch.where(given, sizes, zero)
+        # The sum is tested, because the maximum of ONNX Runtime ignores NaN. A sum in float32 could overflow.
+        is_finite = sizes.sum((0, 1), dtype=torch.float64) < torch.inf
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
-        if noise is not None:
-            has_noise = _is_usable(noise, there)
-            is_finite = is_finite & has_noise
         if rig is not None:
-            values = torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach()
-            sound = (values.abs() < limit).all(-1)  # (B, N)
-            is_finite = is_finite & (sound | ~there.mT).all(-1)
-            eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
-            rotation = torch.where(sound[..., None, None], rig.rotation, eye)
-            rig = Pose(rotation, torch.where(sound[..., None], rig.translation, 0.0))
-            is_camera = (is_camera | ~there).all(0)
-        if confidence is not None:
-            is_probability = ((confidence >= 0) & (confidence <= 1)) | confidence.isnan()
-            is_finite = is_finite & (is_probability | ~there.mT).all(-1)
-            confidence = torch.where(is_probability & there.mT, confidence, torch.nan)
-        there = there & (is_camera & is_finite) & (size < limit)
-        rows = torch.where(there, rows, zero)  # all numbers are finite now, so that products with 0 are 0
+            is_camera = (is_camera | ~given).all(0)
+        there = given & (is_camera & is_finite) & (sizes[3:5].amax(0) < limit)
+        # A pair at an impossible distance or angle loses its weight, but its problem stays valid.
+        distance, typical = _distances(rows[:3].detach(), there, padded)
+        there = there & (distance <= _LARGEST_DISTANCE * typical)
+        rows = torch.where(there, rows, zero)  # all numbers are finite now, also in the unit of the typical distance
         focal = rows.new_full((), self.f_const)  # made on the device, so that a GPU need not wait for the CPU
         img_scales = focal / camera[:5:4]  # (2, 1 or N, B)
 
-        # A pair at an impossible angle or distance loses its weight, but its problem stays valid.
         pixels = (rows[3:5] - camera[2:6:3]) * img_scales
-        tangent = pixels.detach().abs().amax(0) / self.f_const
-        sq_distance, typical = _distances(rows[:3].detach(), there, padded)
-        there = there & (tangent <= 1.0 / MIN_DEPTH_RATIO) & (sq_distance <= _LARGEST_DISTANCE**2 * typical)
+        off_axis = pixels.detach().abs().amax(0)  # f_const times the tangent of the angle from the axis
+        there = there & (off_axis <= self.f_const / MIN_DEPTH_RATIO)
         number = there.sum(0)
-        far = torch.where(number < _MANY, _FAR_OF_FEW**2, _FAR**2) * typical
-        seen = there & (tangent <= _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (sq_distance <= far)  # keep wide angles of few pairs
-        is_usual, is_there = usual.to(rows.dtype), there.to(rows.dtype)
+        far = torch.where(number < _MANY, typical.new_full((), _FAR_OF_FEW), _FAR) * typical
+        seen = there & (off_axis <= self.f_const * _FAR_ANGLE)
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # keep wide angles of few pairs
+        is_usual = usual.to(rows.dtype)
 
-        # Compute centre and scale from the usual points.
+        # Compute centre and scale from the usual points. Squares are in units of the largest coordinate.
         share = is_usual.sum(0).clamp(min=1.0).reciprocal()
         usual_points = rows[:3] * is_usual
         mean = usual_points.sum(1) * share
-        centred = torch.addcmul(usual_points, mean[:, None], is_usual, value=-1)
-        largest = usual_points.detach().abs().amax((0, 1))
-        spread_out = span_a_plane(centred.detach(), share, largest) & (largest > 1.0 / limit)
-        mean_square = (centred if self.center else usual_points).square().sum((0, 1)) * share
-        scale = torch.where(spread_out, mean_square, one[0]).rsqrt() if self.scale else one[0]
+        unit = usual_points.detach().abs().amax((0, 1)).clamp(min=limits.tiny)
+        centred = torch.addcmul(usual_points, mean[:, None], is_usual, value=-1) / unit
+        spread_out, is_precise = span_a_plane(centred.detach(), share)
+        mean_square = (centred if self.center else usual_points / unit).square().sum((0, 1)) * share
+        unit, mean_square = (torch.where(is_precise, x, one[0]) for x in (unit, mean_square))
+        size = mean_square.sqrt() * unit if self.scale else one[0]
         centroid = mean if self.center else zero.expand(3, batch)
 
-        status = torch.where(spread_out, Status.SOLVED.value, Status.DEGENERATE.value)
-        for fine, otherwise in (
-            (number >= MIN_PAIRS, Status.TOO_FEW_PAIRS),
-            (is_camera, Status.CAMERA),
-            (is_finite, Status.NOT_FINITE),
-        ):
-            status = torch.where(fine, status, otherwise.value)
+        if noise is not None:
+            has_noise = _is_usable(noise, given, size)
+            is_finite = is_finite & has_noise
+        if rig is not None:
+            values = torch.cat((rig.rotation.flatten(-2), rig.translation / size[:, None, None]), -1).detach()
+            sound = (values.abs() < limit).all(-1)  # (B, N)
+            is_finite = is_finite & (sound | ~given.mT).all(-1)
+            eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
+            rotation = torch.where(sound[..., None, None], rig.rotation, eye)
+            rig = Pose(rotation, torch.where(sound[..., None], rig.translation, 0.0))
+        status = torch.where(spread_out, Status.PRECISION.value, Status.DEGENERATE.value)
+        status = torch.where(is_precise, Status.SOLVED.value, status)
+        status = torch.where(number >= MIN_PAIRS, status, Status.CAMERA.value)  # no camera, or not the pixels' camera
+        if padded:
+            status = torch.where(given.sum(0) >= MIN_PAIRS, status, Status.TOO_FEW_PAIRS.value)
+        ignored = None
+        if left_out is not None:
+            ignored = torch.where(left_out.any(-1), Status.CONFIDENCE.value, Status.SOLVED.value)
+            status = torch.where(status == Status.TOO_FEW_PAIRS.value, ignored.maximum(status), status)
+        status = torch.where(is_finite, status, Status.NOT_FINITE.value)
         valid = status == Status.SOLVED.value
-        # Pairs without weight get the skew 0, because the product with their large pixels could overflow.
-        without_skew = torch.addcmul(pixels[:1], camera[1] / camera[0] * is_there, pixels[1:], value=-1)
-        world = (rows[:3] - centroid[:, None]) * scale
+        without_skew = torch.addcmul(pixels[:1], camera[1] / camera[0], pixels[1:], value=-1)
+        world = (rows[:3] - centroid[:, None]) / size
         # An invalid problem becomes zeros, without gradient.
-        rows = torch.cat((world, without_skew, pixels[1:], rows[5:])) * (is_there * valid)
+        rows = torch.where(there & valid, torch.cat((world, without_skew, pixels[1:], rows[5:])), zero)
 
         order = None
         if self.order:
@@ -261,53 +279,56 @@ class Normalize(Configured):
             rows = rows.gather(1, order.mT.expand(6, -1, -1))
             is_usual = is_usual.gather(0, order.mT)
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
-        horizontal, vertical = img_scales.sqrt()
-        img_scale = horizontal * vertical  # (1 or N, B)
+        horizontal, vertical = img_scales
+        img_scale = (horizontal * vertical).abs().sqrt()  # (1 or N, B)
         eye = torch.eye(3, dtype=camera.dtype, device=camera.device).view(9, *(1,) * (cameras.ndim - 1))
         matrices = torch.where(is_camera, cameras, eye)
         matrices = (matrices.mT if intrinsics.ndim == 3 else matrices.permute(2, 1, 0)).unflatten(-1, (3, 3))
         mean_scale = img_scale[0]
         if rig is not None:  # a problem without pairs gets the scale 1
-            share = is_there / is_there.sum(0).clamp(min=1.0)
+            share = there.to(rows.dtype) / number.clamp(min=1)
             mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
-        frame = Frame(centroid.mT, scale, mean_scale, order, status, matrices)
+        frame = Frame(centroid.mT, size, mean_scale, order, status, matrices, ignored)
         if noise is not None:
             # Unknown (NaN) and impossible sigmas are replaced first, so that the gradient of the scale is not NaN.
             known = [has_noise[:, None] & ~sigma.isnan() for sigma in noise[:2]]
+            units = img_scale.mT.reciprocal(), size[:, None]
             scaled = [
-                torch.where(is_known, torch.where(is_known, sigma, 0.0) * unit, torch.nan)
-                for is_known, sigma, unit in zip(known, noise[:2], (img_scale.mT, scale[:, None]), strict=True)
+                torch.where(is_known, torch.where(is_known, sigma, 0.0) / unit, torch.nan)
+                for is_known, sigma, unit in zip(known, noise[:2], units, strict=True)
             ]
             noise = noise._replace(img=scaled[0], world=scaled[1])
             if noise.covariances:
                 pixel_map = [x.mT for x in (img_scales[0], -camera[1] / camera[0] * img_scales[1], img_scales[1])]
-                noise = self._scaled_covariances(noise, (there & has_noise).mT, pixel_map, scale)
+                noise = self._scaled_covariances(noise, (there & has_noise).mT, pixel_map, size)
         if rig is not None:
-            rig = Pose(rig.rotation, rig.translation * scale[:, None, None])
+            rig = Pose(rig.rotation, rig.translation / size[:, None, None])
         if order is not None:
             position = order
             noise, confidence, rig = map_tensors(
                 lambda x: x.gather(1, position.view(*position.shape, *(1,) * (x.ndim - 2)).expand_as(x)),
                 (noise, confidence, rig),
             )
-        scales = mean_scale, scale, is_usual.mT
+        scales = mean_scale, size.reciprocal(), is_usual.mT
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 
-    def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], scale: Tensor) -> Noise:
+    def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], size: Tensor) -> Noise:
         """Convert covariances to the units of the problem. Covariances of pairs that are not ``sound`` are ignored."""
         # `pixel_map` holds the entries a, b, d of the matrix [[a, b], [0, d]] that multiplies pixels.
         img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), (noise.img_cov, noise.world_cov))
         if img_cov is not None:
             img_cov = img_cov.mapped(*pixel_map).at_least((LEAST_NOISE * self.f_const) ** 2)
         if world_cov is not None:
-            world_cov = world_cov.scaled(scale.square()[:, None])
+            world_cov = world_cov.divided(size[:, None])
         return noise._replace(img_cov=img_cov, world_cov=world_cov)
 
 
-def _is_usable(noise: Noise, there: Tensor) -> Tensor:
+def _is_usable(noise: Noise, given: Tensor, size: Tensor) -> Tensor:
     """Whether each sigma is NaN or a finite number of at least 0, and each covariance is semi-definite, bool (B,)."""
     usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
-    return torch.stack([*usable, *((are_semi_definite(x) | ~there.mT).all(-1) for x in noise.covariances)]).all(0)
+    world_cov = map_tensors(lambda x: x.detach() / size[:, None] / size[:, None], noise.world_cov)
+    covariances = noise._replace(world_cov=world_cov).covariances
+    return torch.stack([*usable, *((are_semi_definite(x) | ~given.mT).all(-1) for x in covariances)]).all(0)
 
 
 def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
@@ -316,7 +337,7 @@ def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
     entries = camera.detach()
     scaled = entries / entries[8:]
     # The sum of absolute values bounds each value. NaN compares false.
-    largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].rsqrt())).abs().sum(0)
+    largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].reciprocal())).abs().sum(0)
     below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
     fine = (largest < limit) & ~below_diagonal
     camera = torch.where(fine, camera, 1.0)
@@ -324,11 +345,16 @@ def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Tensor]:
-    """Squared distances (N, B) of points (3, N, B) from their median, and the squared typical distance (B,)."""
+    """Distances (N, B) of points (3, N, B) from their median, and the typical distance (B,)."""
     counts = there.sum(0) if padded else points.shape[1]
     points = torch.where(there, points, torch.inf)
     middle = ranked(points, (counts - 1) // 2).nan_to_num(posinf=0.0)
-    sq_distance = (points - middle[:, None]).square().sum(0)
-    typical = ranked(sq_distance[None], 2 * counts // 3)[0]
+    offset = points - middle[:, None]
+    if exporting():  # ONNX has no `hypot`
+        distance = offset.square().sum(0).sqrt()
+    else:  # squares could overflow or underflow
+        x, y, z = offset
+        distance = x.hypot(y).hypot(z)
+    typical = ranked(distance[None], 2 * counts // 3)[0]
     # If two thirds of the points coincide, an infinite typical distance makes all points usual.
-    return sq_distance, typical.masked_fill(typical == 0, torch.inf)
+    return distance, typical.masked_fill(typical == 0, torch.inf)

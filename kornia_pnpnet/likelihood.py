@@ -144,29 +144,36 @@ def monte_carlo_pose_loss(
     img, world = (torch.where(known[:, None], x, 1.0) for x in noise[:2])
     with torch.no_grad():  # a gradient of the frame would only add noise to the integral's gradient
         _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
-    unit = frame.scale[:, None]
-    world_noise = None if noise.world_cov is None else noise.world_cov.scaled(unit.square())
-    noise = noise._replace(img=img, world=world * unit, world_cov=world_noise)
-    points = (inputs.world_points - frame.centroid[:, None]) * unit[..., None]
+    unit = frame.size[:, None]
+    world_noise = None if noise.world_cov is None else noise.world_cov.divided(unit)
+    noise = noise._replace(img=img, world=world / unit, world_cov=world_noise)
+    points = (inputs.world_points - frame.centroid[:, None]) / unit[..., None]
     problem, _ = Normalize(center=False, scale=False, order=False)(points, *inputs[1:5], noise)
 
-    live, eye, poses = frame.valid & known, torch.eye(3).to(points), []
+    live, poses = frame.valid & known, []
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
     given = [x.init for _, x in checked if x.init is not None]
     for pose in given:
         live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
     for pose in given:  # a refused problem gets a constant pose
         rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
         poses.append(frame.apply(Pose(rotation, torch.where(live[:, None], pose.translation.detach(), eye[2]))))
-    refine = RobustWeightedLM(
-        _MODE_ITERATIONS, kernel=kernel, robustness=scale, damping=_MODE_DAMPING, reject_worse=False, learnable=False
-    ).to(points)
+    with points.device:
+        refine = RobustWeightedLM(
+            _MODE_ITERATIONS,
+            kernel=kernel,
+            robustness=scale,
+            damping=_MODE_DAMPING,
+            reject_worse=False,
+            learnable=False,
+        ).to(points)
     model = _Posterior(problem, _Prior(poses[0].translation), refine, points.new_tensor(scale), noisy_points)
     with torch.no_grad():
         drawn, log_proposal = _draw(model._replace(problem=problem.map(Tensor.detach)), poses, samples // count, rounds)
     log_weights = model.log_density(drawn) - log_proposal
     log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
     log_density = model.log_density(Pose(*(x[None] for x in poses[0])))[0] - log_total
-    return torch.where(live, -log_density - 3.0 * frame.scale.log(), 0.0).reshape(size)
+    return torch.where(live, -log_density + 3.0 * frame.size.log(), 0.0).reshape(size)
 
 
 class _Prior(NamedTuple):
@@ -181,8 +188,8 @@ class _Prior(NamedTuple):
 
     def sample(self, count: int) -> Pose:
         """Draw poses, (S, B, ...)."""
-        batch = len(self.translation)
-        rotation = quaternion_to_rotation_matrix(torch.randn(count, batch, 4).to(self.translation))
+        random = self.translation.new_empty(count, len(self.translation), 4).normal_()
+        rotation = quaternion_to_rotation_matrix(random)
         shift = _PRIOR_TRANSLATION * self.distance * _sample_t(count, self.translation)
         return Pose(rotation, self.translation + shift)
 

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import torch
 from kornia.geometry.camera import project_points
-from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_shapes, check_whole
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Noise, Starts
 from kornia_pnpnet.result import PnPResult, Pose, Problems, check_poses
@@ -71,7 +70,8 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
     rotation = estimate.rotation - truth.rotation
     translation = estimate.translation - truth.translation
     if origin is not None:
-        translation = translation + (rotation * origin[:, None]).sum(-1)
+        check_shapes({"origin": (origin, tuple(translation.shape))})
+        translation = translation + (rotation * origin[..., None, :]).sum(-1)
     tiny = torch.finfo(rotation.dtype).tiny
     return (rotation.square().sum((-2, -1)) + tiny).sqrt(), (translation.square().sum(-1) + tiny).sqrt()
 
@@ -141,7 +141,7 @@ class PoseLoss(nn.Module):
         Raises:
             BaseError: when result and truth differ in shape, dtype or device.
         """
-        init_rotation, init_translation = pose_distances(result.init, problems.pose, problems.world_points.mean(1))
+        init_rotation, init_translation = pose_distances(result.init, problems.pose, problems.world_points.mean(-2))
         rotation, translation = _refined_distances(result, problems, ramp)
         init = self.rotation * init_rotation + self.init_translation * init_translation
         refined = self.rotation * rotation + self.translation * translation
@@ -204,16 +204,17 @@ class SetLoss(nn.Module):
 
     def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Starts) -> LossTerms:
         """See :meth:`PoseLoss.forward`. ``guess``: starts of :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`."""
-        centre = problems.world_points.mean(1)
-        distance = transform_points(problems.pose.matrix, centre[:, None])[:, 0].norm(dim=-1)
+        centre = problems.world_points.mean(-2)
+        rotation, translation = problems.pose
+        distance = ((rotation @ centre[..., None])[..., 0] + translation).norm(dim=-1)
 
         every = [pose_distances(pose, problems.pose, centre) for pose in guess.poses[: self.starts]]
-        rotations, translations = (torch.stack(x, 1) for x in zip(*every, strict=True))  # (B, S) each
-        translations = translations / distance[:, None]
+        rotations, translations = (torch.stack(x, -1) for x in zip(*every, strict=True))  # (B, S) each
+        translations = translations / distance[..., None]
         sums = rotations + translations
-        best = sums.argmin(1, keepdim=True)
-        init_rotation, init_translation, least = (x.gather(1, best)[:, 0] for x in (rotations, translations, sums))
-        first = (1.0 - self.every) * least + self.every * sums.mean(1)
+        best = sums.argmin(-1, keepdim=True)
+        init_rotation, init_translation, least = (x.gather(-1, best)[..., 0] for x in (rotations, translations, sums))
+        first = (1.0 - self.every) * least + self.every * sums.mean(-1)
 
         rotation, translation = _refined_distances(result, problems, ramp, centre)
         translation = translation / distance
@@ -230,10 +231,10 @@ class SetLoss(nn.Module):
 def _negative_log_likelihood(noise: Noise, problems: Problems) -> Tensor:
     """Mean negative log-likelihood of the inliers' residuals at the true pose, up to a constant, (B,)."""
     cam = problems.true_cam_points
-    cam = torch.where(problems.inliers[..., None], cam, torch.eye(3).to(cam)[2])
+    cam = torch.where(problems.inliers[..., None], cam, torch.eye(3, dtype=cam.dtype, device=cam.device)[2])
     cameras = problems.pair_intrinsics
     sq_residual = (project_points(cam, cameras.expand(*cam.shape, 3)) - problems.img_points).square().sum(-1)
-    moved = cameras.diagonal(dim1=-2, dim2=-1)[..., :2].mean(-1) * noise.world / cam[..., 2]
+    moved = cameras.diagonal(dim1=-2, dim2=-1)[..., :2].abs().mean(-1) * noise.world / cam[..., 2]
     variance = noise.img.square() + moved.square() * (1.0 + 0.5 * (cam[..., :2] / cam[..., 2:]).square().sum(-1))
     loss = variance.log() + 0.5 * (sq_residual / variance).clamp(max=_MOST_VARIANCES)
     return torch.where(problems.inliers, loss, 0.0).sum(-1) / problems.inliers.sum(-1).clamp(min=1)

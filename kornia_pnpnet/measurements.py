@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
+from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_to_homogeneous
@@ -37,7 +37,8 @@ def heatmap_keypoints(
     Source: A. Nibali et al., "Numerical Coordinate Regression with Convolutional Neural Networks", 2018 (DSNT).
 
     Args:
-        heatmaps: logits, shape :math:`(B, N, H, W)`. For maps of probabilities pass their logarithms.
+        heatmaps: logits, shape :math:`(B, N, H, W)`; :math:`B` stands for any number of leading dimensions. For maps
+            of probabilities pass their logarithms.
         temperature: positive divisor of the logits, a number or a tensor that broadcasts to ``heatmaps``.
         stride: image pixels per cell of the map. Cell 0 covers the first ``stride`` pixels.
 
@@ -46,8 +47,8 @@ def heatmap_keypoints(
         map with NaN gives NaN, and the problem of the map is then not ``ok``.
 
     Raises:
-        BaseError: when ``heatmaps`` is not a real tensor of four dimensions, or when ``temperature`` or ``stride`` is a
-            number that is not positive.
+        BaseError: when ``heatmaps`` is not a real tensor of maps with at least one cell, when ``temperature`` does not
+            broadcast to its shape, or when ``temperature`` or ``stride`` is a number that is not positive.
 
     Example:
         >>> heatmaps = torch.full((1, 1, 5, 5), -100.0)
@@ -59,11 +60,14 @@ def heatmap_keypoints(
         tensor([[[[0.7500, 0.0000],
                   [0.0000, 0.0833]]]])
     """
-    KORNIA_CHECK_SHAPE(heatmaps, ["B", "N", "H", "W"])
+    KORNIA_CHECK_SHAPE(heatmaps, ["*", "N", "H", "W"])
+    KORNIA_CHECK(0 not in heatmaps.shape[-2:], f"A heat map needs at least one cell, got {tuple(heatmaps.shape)}.")
     check_positive(stride=stride)
     if not isinstance(temperature, Tensor):
         check_positive(temperature=temperature)
-    share = spatial_softmax2d(heatmaps.to(common_dtype({"heatmaps": heatmaps})) / temperature)
+    logits = heatmaps.to(common_dtype({"heatmaps": heatmaps})) / temperature
+    check_shapes({"heatmaps / temperature": (logits, tuple(heatmaps.shape))})
+    share = spatial_softmax2d(logits.reshape(heatmaps.shape[:-3].numel(), *heatmaps.shape[-3:]))
     mean = spatial_expectation2d(share, normalized_coordinates=False)  # (B, N, 2), cells
     height, width = share.shape[-2:]
     u = torch.arange(width, dtype=share.dtype, device=share.device) - mean[..., :1]  # (B, N, W)
@@ -71,7 +75,8 @@ def heatmap_keypoints(
     uu = (share.sum(-2) * u.square()).sum(-1) + _CELL_VARIANCE
     vv = (share.sum(-1) * v.square()).sum(-1) + _CELL_VARIANCE
     uv = (v * (share @ u[..., None])[..., 0]).sum(-1)
-    covariance = torch.stack((uu, uv, uv, vv), -1).unflatten(-1, (2, 2))
+    covariance = torch.stack((uu, uv, uv, vv), -1).reshape(*heatmaps.shape[:-2], 2, 2)
+    mean = mean.reshape(*heatmaps.shape[:-2], 2)
     return stride * mean + 0.5 * (stride - 1.0), stride**2 * covariance
 
 
@@ -94,7 +99,8 @@ def depth_points(
     of errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
 
     Args:
-        img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`.
+        img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`; :math:`B` stands for any
+            number of leading dimensions, also for none.
         depth: depth along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -123,17 +129,17 @@ def depth_points(
     for name, value in (("img_points", img_points), ("depth", depth)):
         if not isinstance(value, Tensor):
             raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
-    KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
+    KORNIA_CHECK_SHAPE(img_points, ["*", "N", "2"])
     if img_sigma is not None and img_cov is not None:
         raise ValueCheckError("Give img_sigma or img_cov, not both.")
-    batch, count = img_points.shape[:2]
+    *batch, count = img_points.shape[:-1]
     camera = camera_matrices(intrinsics)
     shapes: Shapes = {
-        "depth": (depth, (batch, count)),
-        "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (batch, 3, 3)),
-        "rotation of the pose": (pose.rotation, (batch, 3, 3)),
-        "translation of the pose": (pose.translation, (batch, 3)),
-        "img_cov": (img_cov, (batch, count, 2, 2)),
+        "depth": (depth, (*batch, count)),
+        "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (*batch, 3, 3)),
+        "rotation of the pose": (pose.rotation, (*batch, 3, 3)),
+        "translation of the pose": (pose.translation, (*batch, 3)),
+        "img_cov": (img_cov, (*batch, count, 2, 2)),
     }
     check_shapes(shapes)
     tensors = {name: tensor for name, (tensor, _) in shapes.items()}
@@ -153,8 +159,8 @@ def depth_points(
     # Rays in the axes of the world. Kornia's unprojection is not used, because it ignores the skew.
     back = rotation.mT @ torch.linalg.inv_ex(camera).inverse  # (B, 3, 3)
     rays = convert_points_to_homogeneous(pixels) @ back.mT  # (B, N, 3)
-    points = depth[..., None] * rays - translation[:, None] @ rotation
-    across = back[:, None, :, :2]  # (B, 1, 3, 2)
+    points = depth[..., None] * rays - translation[..., None, :] @ rotation
+    across = back[..., None, :, :2]  # (B, 1, 3, 2)
     variance = sigma_depth.square()[..., None, None]
     covariance = (depth.square()[..., None, None] + variance) * (across @ noise @ across.mT)
     covariance = covariance + variance * rays[..., :, None] * rays[..., None, :]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_devices, check_whole
+from kornia_pnpnet.core.checks import check_devices, check_shapes, check_whole
 from kornia_pnpnet.refine.residual import rotation_angle
 from kornia_pnpnet.result import Pose, check_poses
 
@@ -130,13 +130,15 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         bool, shape :math:`(B,)`. False where an error is NaN.
 
     Raises:
-        DeviceError: when tensors are on different devices.
+        BaseError: when tensors are on different devices, or have other shapes.
 
     Example:
         >>> success(PoseErrors(torch.tensor([0.5, 0.5, 2.0]), torch.tensor([0.1, 0.3, 0.1])))
         tensor([ True, False, False])
     """
-    limit = max_translation if isinstance(max_translation, Tensor) else None
+    limit = max_translation if isinstance(max_translation, Tensor) and max_translation.ndim else None
+    batch = tuple(errors.translation_error.shape)
+    check_shapes({"rotation_error_deg": (errors.rotation_error_deg, batch), "max_translation": (limit, batch)})
     tensors = {"rotation_error_deg": errors.rotation_error_deg, "max_translation": limit}
     check_devices(tensors, errors.translation_error, "translation_error")
     return (errors.rotation_error_deg < max_rotation_deg) & (errors.translation_error < max_translation)
@@ -151,15 +153,15 @@ def success_rate(successes: Tensor) -> SuccessRate:
         successes: bool, any shape with at least one element.
 
     Raises:
-        ValueError: when ``successes`` is empty.
+        ValueError: when ``successes`` is empty or not bool.
 
     Example:
         >>> print(success_rate(torch.tensor([True] * 8 + [False] * 2)))
         80.0 % [49.0, 94.3]
     """
     count = successes.numel()
-    if count == 0:
-        raise ValueError("success_rate needs at least one problem, got none.")
+    if count == 0 or successes.dtype != torch.bool:
+        raise ValueError(f"success_rate needs bool for at least one problem, got {count} of {successes.dtype}.")
     rate = successes.to(torch.float64).mean().item()
     z = _Z_95
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)

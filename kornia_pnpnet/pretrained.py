@@ -188,20 +188,23 @@ class PretrainedMixin(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name_or_folder: str | Path) -> Self:
-        """Load a trained solver, in evaluation mode.
+        """Load a trained solver, in evaluation mode, whose parameters require gradients.
+
+        The solver can be trained further after ``solver.train()``. For inference alone, use ``torch.no_grad()`` or
+        ``solver.requires_grad_(False)``, or :func:`~kornia_pnpnet.create_solver` for shipped solvers.
 
         Args:
             name_or_folder: see :func:`~kornia_pnpnet.pretrained.find_weights`. No code in the files is run.
 
         Returns:
-            The solver in float32 on the CPU.
+            The solver in float32 on PyTorch's default device.
 
         Raises:
             FileNotFoundError: when no shipped weights, folder or repository has this name.
             ValueCheckError: when the files are damaged or belong to another model.
         """
         config, state = read_weights(name_or_folder)
-        model = cls.from_config(config)
+        model = cls.from_config(config).float()
         try:
             model.load_state_dict(state)
         except RuntimeError as error:

@@ -225,7 +225,11 @@ class Starts(NamedTuple):
     @property
     def poses(self) -> list[Pose]:
         """``pose`` and ``others`` in one list, each pose with the shapes :math:`(B, 3, 3)` and :math:`(B, 3)`."""
-        others = () if self.others is None else map(Pose, *(x.unbind(1) for x in self.others))
+        others = (
+            ()
+            if self.others is None
+            else map(Pose, self.others.rotation.unbind(-3), self.others.translation.unbind(-2))
+        )
         return [self.pose, *others]
 
     def with_others(self, *more: Pose) -> Starts:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, Literal, TypeAlias, overload
 
 import torch
 from kornia.core.exceptions import ValueCheckError
@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PoseLib, PyColmap
+from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.pretrained import shipped_weights
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import SubsetSolver
@@ -24,6 +24,10 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
+# Solvers of other libraries, for type checkers.
+_Peer: TypeAlias = Literal[
+    "opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap"
+]
 # Iterations of the classical robust LM: `_FEW` from another method's pose, `_MANY` from the identity.
 _FEW, _MANY = 10, 30
 # Pairs in a sample of the paper's RANSAC.
@@ -87,11 +91,21 @@ def list_solvers() -> list[str]:
     return sorted(_builders())
 
 
+@overload
+def create_solver(name: _Peer, **options: Any) -> PeerSolver: ...
+
+
+@overload
+def create_solver(name: str, **options: Any) -> PnPNet: ...
+
+
 def create_solver(name: str, **options: Any) -> nn.Module:
     """Build a solver by its name.
 
     Every solver is called as ``solver(world_points, img_points, intrinsics, weights=None, mask=None)`` and returns a
-    :class:`~kornia_pnpnet.result.PnPResult`.
+    :class:`~kornia_pnpnet.result.PnPResult`. Solvers of this package take more arguments, see
+    :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. For a type checker, a solver is a ``PnPNet`` unless
+    ``name`` is a literal that names a solver of another library.
 
     Args:
         name: one of :func:`list_solvers`.
@@ -103,7 +117,9 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
-        The solver as a module in evaluation mode.
+        The solver as a module in evaluation mode. Its parameters do not require gradients, so that a result has a
+        graph only if an input requires gradients. To train a shipped solver further, load it with
+        ``PnPNet.from_pretrained``.
 
     Raises:
         ValueCheckError: for an unknown name or option.
@@ -124,15 +140,17 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             if not isinstance(solver, PnPNet):
                 raise TypeError(f"{' and '.join(ours)}: for solvers of this package only")
             solver = solver.with_options(**ours)
-        return solver.eval()
+        return solver.eval().requires_grad_(False)
     except TypeError as error:
-        raise ValueCheckError(f"Solver {name!r} does not take these options: {error}.") from error
+        reason = str(error).rpartition("() ")[2]  # without the name of a function
+        raise ValueCheckError(f"Solver {name!r} does not take these options: {reason}.") from error
 
 
 @lru_cache(maxsize=8)
-def _frozen(name: str, device: torch.device) -> nn.Module:
-    """Build a solver whose parameters have no gradients, once for each name and device."""
-    return create_solver(name).to(device).requires_grad_(False)
+def _on_device(name: str, device: torch.device) -> nn.Module:
+    """Build a solver once for each name and device."""
+    with device:
+        return create_solver(name)
 
 
 def solve_pnp(
@@ -175,7 +193,7 @@ def solve_pnp(
     """
     if isinstance(solver, str):
         device = world_points.device if isinstance(world_points, Tensor) else torch.device("cpu")
-        solver = _frozen(solver, device)
+        solver = _on_device(solver, device)
     lens = {name: x for name, x in (("dist", dist), ("fisheye", fisheye)) if x is not None}
     result = solver(world_points, img_points, intrinsics, weights, **lens)
     return torch.where(result.ok[..., None, None], result.matrix[..., :3, :], torch.nan)

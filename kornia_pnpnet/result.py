@@ -7,8 +7,9 @@ Each class of tensors is a ``NamedTuple`` and therefore a pytree, which ``torch.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
-from enum import IntEnum
+from enum import IntEnum, unique
 from typing import Any, NamedTuple
 
 import torch
@@ -25,6 +26,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import Shapes, check_like, check_shapes
 from kornia_pnpnet.core.linalg import gate
+from kornia_pnpnet.core.performance import sees_values
 from kornia_pnpnet.core.trees import map_tensors
 
 __all__ = [
@@ -101,11 +103,17 @@ class Pose(NamedTuple):
     def camera(self, intrinsics: Tensor | PinholeCamera, height: int = 1, width: int = 1) -> PinholeCamera:
         r"""Kornia's camera with the pose as its extrinsics.
 
+        Kornia's cameras have one batch dimension. A single pose becomes a batch of one, and other leading dimensions
+        are merged.
+
         Args:
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`; or Kornia's camera, whose image size
                 replaces ``height`` and ``width``.
             height: height of the image in pixels. Projection ignores the height.
             width: width of the image in pixels. Projection ignores the width.
+
+        Raises:
+            ShapeError: when the intrinsics have other shapes.
 
         Example:
             >>> pose = Pose(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 2.0]]))
@@ -113,13 +121,17 @@ class Pose(NamedTuple):
             >>> camera.project(torch.tensor([[0.1, 0.0, 0.0]]))
             tensor([[345., 240.]])
         """
-        batch = len(self.translation)
+        leading = self.translation.shape[:-1]
+        batch, matrices = leading.numel(), camera_matrices(intrinsics)
+        if matrices.ndim > 2:
+            of_cameras = (batch,) if isinstance(intrinsics, PinholeCamera) else leading
+            check_shapes({"intrinsics": (matrices, (*of_cameras, 3, 3))})
+        matrices = matrices.reshape(-1, 3, 3).expand(batch, 3, 3)
         size = [self.translation.new_full((batch,), x) for x in (height, width)]
         if isinstance(intrinsics, PinholeCamera):
             size = [x.expand(batch) for x in (intrinsics.height, intrinsics.width)]
-        matrices = camera_matrices(intrinsics).expand(batch, 3, 3)
-        no_shift = torch.zeros_like(self.translation)[..., None]
-        return PinholeCamera(Rt_to_matrix4x4(matrices, no_shift), self.matrix, *size)
+        no_shift = torch.zeros_like(matrices[..., :1])
+        return PinholeCamera(Rt_to_matrix4x4(matrices, no_shift), self.matrix.reshape(-1, 4, 4), *size)
 
 
 def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
@@ -172,25 +184,35 @@ class PosePrior(NamedTuple):
     scale: Tensor | None = None
 
 
+@unique
 class Status(IntEnum):
     """The values of ``PnPResult.status``: why a problem is not ``ok``."""
 
     #: The problem is ``ok``.
     SOLVED = 0
-    #: Fewer than 3 pairs have a positive weight and pass the tests of angle and distance in ``Normalize``.
+    #: Fewer than 3 pairs have a positive weight.
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
     #: An input is invalid: a coordinate, weight or covariance that is not finite, an infinite sigma, a negative weight
-    #: or sigma, a covariance that is not positive semi-definite, a confidence outside of [0, 1], or an invalid prior.
+    #: or sigma, a covariance that is not positive semi-definite, or an invalid prior.
     NOT_FINITE = 3
-    #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]`` with positive ``fx`` and ``fy``.
+    #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``, ``fx`` or ``fy`` is 0, or almost
+    #: all pixels are 89.9 degrees off the optical axis, so that the intrinsics do not fit the pixels.
     CAMERA = 4
     #: The pairs are too little evidence for the best pose. Solvers return this status for problems of three pairs; use
     #: :func:`~kornia_pnpnet.propose.p3p.p3p` for such problems.
     NOT_BELIEVED = 5
     #: Fewer than 3 pairs are in front of the camera at the best pose.
     BEHIND = 6
+    #: The dtype has too few digits for the points: the coordinates are large, and their differences are small. Use
+    #: float64, or subtract an offset from the points before they become float32.
+    PRECISION = 7
+    #: Pairs were left out because their ``confidence`` is not in [0, 1], and the other pairs determine no pose.
+    CONFIDENCE = 8
+    #: The pose ``init`` was ignored because it is not finite or its determinant is not positive, and no other pose was
+    #: found.
+    INIT = 9
 
 
 class Alternatives(NamedTuple):
@@ -217,6 +239,10 @@ class Alternatives(NamedTuple):
         empty = pose.translation.detach()[:, :0]  # (B, 0)
         vectors = empty[..., None].expand(-1, -1, 3)
         return cls(vectors[..., None].expand(-1, -1, -1, 3), vectors, empty, empty, empty > 0)
+
+
+# Default of fields that every solver of this package sets. The type spares users a test for `None`.
+_UNSET: Any = None
 
 
 class PnPResult(NamedTuple):
@@ -252,13 +278,40 @@ class PnPResult(NamedTuple):
     cost: Tensor
     ok: Tensor
     init: Pose
-    status: Tensor | None = None
-    probability: Tensor | None = None
+    status: Tensor = _UNSET
+    probability: Tensor = _UNSET
     alternatives: Alternatives | None = None
-    intrinsics: Tensor | None = None
-    dist: Tensor | None = None
-    sigma: Tensor | None = None
-    inliers: Tensor | None = None
+    intrinsics: Tensor = _UNSET
+    dist: Tensor = _UNSET
+    sigma: Tensor = _UNSET
+    inliers: Tensor = _UNSET
+
+    def __repr__(self) -> str:
+        """Five lines: the number of problems that are ok, medians and ranges of what the solver knows, and the pose."""
+        shown = self.ok, self.status, self.inliers, self.sigma, self.probability, *self.pose
+        known = [x for x in shown if type(x) is Tensor and sees_values(x) and x.numel()]
+        if len(known) < len(shown):
+            return tuple.__repr__(self)
+        flat = (x.detach().reshape(-1, *x.shape[self.ok.ndim :]) for x in known)
+        ok, status, inliers, sigma, probability, rotation, translation = flat
+
+        def spread(values: Tensor) -> str:
+            low, median, high = (f"{x:.4g}" for x in (values.min(), values.median(), values.max()))
+            return median if low == high else f"{median} ({low} to {high})"
+
+        failed = Counter(Status(x).name for x in status[~ok].tolist())
+        pose = ", ".join(f"{name} {(*x.shape,)}" for name, x in self.pose._asdict().items())
+        if len(ok) == 1:
+            vectors = {"rotation vector": Pose(rotation, translation).rvec, "translation": translation}
+            pose = ", ".join(f"{name} {' '.join(f'{x:.4g}' for x in v[0])}" for name, v in vectors.items())
+        lines = (
+            ", ".join([f"{int(ok.sum())} of {len(ok)} ok", *(f"{n} {name}" for name, n in failed.items())]),
+            f"inliers {spread(inliers.sum(1))} of {inliers.shape[1]}",
+            f"sigma {spread(sigma)} px",
+            f"probability {spread(probability)}",
+            f"{pose} ({translation.dtype}, {translation.device})",
+        )
+        return "PnPResult: " + "\n  ".join(lines)
 
     @property
     def pose(self) -> Pose:
@@ -278,7 +331,8 @@ class PnPResult(NamedTuple):
         Args:
             world_points: the points of the solver's call.
             img_points: the pixels of the solver's call.
-            intrinsics: the camera matrices of the solver's call, or of the result for an unknown focal length.
+            intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the ``intrinsics`` of the
+                result replace them.
             noise: further arguments of ``pose_covariance``. If no noise of the pixels is given, the noise is
                 ``sigma``. The default weights are ``inliers``.
 
@@ -287,6 +341,8 @@ class PnPResult(NamedTuple):
         """
         from kornia_pnpnet.covariance import pose_covariance
 
+        if noise.get("focal") == "unknown" and self.intrinsics is not None:
+            intrinsics = self.intrinsics
         if "img_sigma" not in noise and "img_cov" not in noise:
             noise["img_sigma"] = self.sigma
         if "weights" not in noise and self.inliers is not None:
@@ -344,7 +400,7 @@ class Problems(NamedTuple):
     @property
     def true_cam_points(self) -> Tensor:
         """The points in the frame of their camera at the true pose, shape :math:`(B, N, 3)`."""
-        points = self.world_points @ self.pose.rotation.mT + self.pose.translation[:, None]
+        points = self.world_points @ self.pose.rotation.mT + self.pose.translation[..., None, :]
         if self.cam_from_rig is None:
             return points
         return (self.cam_from_rig.rotation @ points[..., None])[..., 0] + self.cam_from_rig.translation
@@ -352,7 +408,7 @@ class Problems(NamedTuple):
     @property
     def pair_intrinsics(self) -> Tensor:
         """The camera matrix of each pair, shape :math:`(B, N, 3, 3)` in a rig, else :math:`(B, 1, 3, 3)`."""
-        return self.intrinsics[:, None] if self.cam_from_rig is None else self.intrinsics
+        return self.intrinsics[..., None, :, :] if self.cam_from_rig is None else self.intrinsics
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Problems:
         """Apply a function to every tensor, for example to slice the batch or to move it to another device."""

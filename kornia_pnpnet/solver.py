@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -15,6 +15,7 @@ from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Runner, in_full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors, put, take
+from kornia_pnpnet.core.watch import GradientWatch
 from kornia_pnpnet.frame import Frame, Normalize
 from kornia_pnpnet.pretrained import PretrainedMixin
 from kornia_pnpnet.problem import Problem, Starts
@@ -65,7 +66,8 @@ class PnPNet(PretrainedMixin):
     gradient. Other problems of the batch do not change.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``. All
-    multiples of a camera matrix are the same camera.
+    multiples of a camera matrix are the same camera. Focal lengths may be negative, for example ``fy`` in an image with
+    v up.
 
     Precision: the layer computes in float64 if any input tensor is float64, else in float32. Results have the dtype of
     the computation. Inputs of float16, bfloat16 and integers are converted, because half precision has too few digits
@@ -87,9 +89,12 @@ class PnPNet(PretrainedMixin):
             effort is ``"fixed"`` or the solver is compiled. In evaluation mode, and unless the effort is ``"fixed"``,
             poses of every solver are compared with their rivals (see
             :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
-        gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``. ``"always"``: all valid
-            problems, to train a network whose poses are still inaccurate. The gradient of each problem's loss with
-            respect to its normalised inputs then has a norm of at most 10.
+        gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``, with a ``RuntimeWarning``
+            if the first batches of a training have none. ``"always"``: all valid problems. The gradient of each
+            problem's loss with respect to its normalised inputs then has a norm of at most 10. A step against the
+            gradient lowers the loss, but the loss of a pose does not determine where the pixels move: a pose has 6
+            numbers, N pixels have 2N. To train a network from nothing, use
+            :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8. The first view is the problem itself, and all others are its
             mirror images (see :mod:`kornia_pnpnet.propose.views`). A network proposes different poses for different
             views. The first 70 % of the iterations refine all poses, and the last 30 % only the best pose.
@@ -147,6 +152,7 @@ class PnPNet(PretrainedMixin):
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
         self.normalize = Normalize() if normalize is None else normalize
         self._run, self._whole = Runner(), Runner()
+        self._watch = GradientWatch()
 
     def forward(
         self,
@@ -184,7 +190,9 @@ class PnPNet(PretrainedMixin):
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
-                of the initialiser. Without an initialiser the refinement starts from ``init`` alone.
+                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. The nearest
+                rotation replaces a matrix that is no exact rotation, also in ``prior``. A pose is ignored if it is not
+                finite, or if the determinant of its matrix is not positive.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
                 :math:`(B, N)`, at least 0; NaN where unknown. With ``img_sigma`` or ``world_sigma``, residuals and the
                 scales of the refinement's kernel are in standard deviations.
@@ -195,7 +203,8 @@ class PnPNet(PretrainedMixin):
             world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
                 :math:`(B, N, 3, 3)`.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
-                :math:`(B, N)`; NaN where unknown. Pairs of high confidence are drawn more often for minimal samples.
+                :math:`(B, N)`; NaN where unknown. Values up to 0.001 below 0 or above 1 are rounded to 0 or 1. A pair
+                with another confidence is left out. Pairs of high confidence are drawn more often for minimal samples.
                 Confidences are an input of networks that were trained with confidences. Confidences need not be
                 calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
@@ -260,7 +269,12 @@ class PnPNet(PretrainedMixin):
         result = restore_leading(size, map_tensors(lambda x: x[:1], result) if single else result)
         if inputs.rig is not None:
             result = result._replace(intrinsics=given_cameras(intrinsics, world_points, result.translation))
+        if not (call.always or first_stage_only):
+            self._watch.see(result.ok, *inputs[:4])
         return result
+
+    if TYPE_CHECKING:  # nn.Module.__call__ accepts and returns Any
+        __call__ = forward
 
     def with_starts(
         self, *args: Any, first_stage_only: bool = False, gradient: str | None = None, **options: Any
@@ -335,9 +349,10 @@ class PnPNet(PretrainedMixin):
             starts = starts._replace(camera=camera)
         plan = self._run(self.refine.begin, seen, starts)
         plan, now = self.refine.iterate(plan, 0 if call.first_stage_only else None, more=more, run=self._run)
-        refined = self._run(self.refine.judge, plan, now)
+        found = odds = None
         if self._compares(inputs, call):
-            refined = reconsider(self.refine, plan, refined, frame.valid, rival)
+            now, found, odds = reconsider(self.refine, plan, now, frame.valid, rival)
+        refined = self._run(self.refine.judge, plan, now, found, odds)
         return _Attempt(
             problem, frame, starts, refined, self._run(self._result, problem.focal, frame, starts, refined, call)
         )
@@ -350,12 +365,17 @@ class PnPNet(PretrainedMixin):
             world, img, weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in problem[:3])
             problem = problem._replace(world_points=world, img_points=img, weights=weights)
         if inputs.prior is not None:
-            prior, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.scale)
+            prior, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
             problem, init = problem._replace(prior=prior), inputs.prior.pose if init is None else init
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
         if inputs.free_focal is not None:
             problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
-        given = frame.start(init) if self.init is None or init is not None else None
+        given = None
+        if self.init is None or init is not None:
+            given, usable = frame.start(init)
+            if init is not None:
+                ignored = torch.zeros_like(frame.status) if frame.ignored is None else frame.ignored
+                frame = frame._replace(ignored=torch.where(usable, ignored, Status.INIT.value))
         views = 1 if call.first_stage_only or self.refine.m == 0 else self.views
         starts = propose(
             self.init,
@@ -380,11 +400,16 @@ class PnPNet(PretrainedMixin):
             intrinsics = scale_focal(intrinsics, torch.where(finite, state.camera[:, 0], 0.0).exp())
         first_ok = frame.valid & first.translation.sum(-1).isfinite()
         status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
-        status = torch.where(ok, Status.SOLVED.value, torch.where(finite, status, Status.DEGENERATE.value))
+        status = torch.where(finite, status, Status.DEGENERATE.value)
+        if frame.ignored is not None:
+            status = torch.where(frame.ignored > 0, frame.ignored, status)
+        status = torch.where(ok, Status.SOLVED.value, status)
         # int64 until here, because `where` of ONNX Runtime does not support int8.
         status = torch.where(frame.valid, status, frame.status).to(torch.int8)
         live = finite if call.always else ok
         pose = gate_pose(pose, live, finite)
+        # In a rig, `forward` returns the cameras as they were given.
+        cameras: Any = None if intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         return PnPResult(
             *pose,
             gate(frame.undo_pairs(refined.weights), live, finite, 0.0),
@@ -394,7 +419,7 @@ class PnPNet(PretrainedMixin):
             status,
             torch.where(finite, refined.probability, 0.0),
             Alternatives.none(pose),
-            None if intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0),
+            cameras,
             gate(as_dist(state.radial), live, finite, 0.0),
             torch.where(finite, found.sigma * focal / frame.img_scale, 0.0),
             frame.undo_pairs(found.inlier).gt(0.5) & finite[:, None],

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -18,6 +19,17 @@ def assert_same(one: Any, two: Any, rtol: float = 0.0, atol: float = 0.0) -> Non
     """The same tensors in two trees, to the bit unless a tolerance is given."""
     for a, b in zip(pytree.tree_leaves(one), pytree.tree_leaves(two), strict=True):
         torch.testing.assert_close(a, b, rtol=rtol, atol=atol)
+
+
+@contextmanager
+def other_defaults(dtype: torch.dtype, device: str = "meta") -> Iterator[None]:
+    """Give PyTorch a default dtype and a default device. Tensors of ``meta`` hold no numbers."""
+    torch.set_default_dtype(dtype)
+    try:
+        with torch.device(device):
+            yield
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def rate(result: Any, problems: Problems, **limits: float) -> float:

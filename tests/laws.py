@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from helpers import assert_same
+from helpers import assert_same, other_defaults
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from kornia.geometry.linalg import transform_points
@@ -73,7 +73,7 @@ def build(case: Case) -> PnPNet:
     options = {"max_samples": 30} if case.solver == "ransac-epnp-lm" else {}
     options |= {"radial": 1} if case.extra == "radial" else {}
     options |= {} if case.solver in PEERS else {"focal": case.focal}
-    return create_solver(case.solver, **options).to(case.dtype).requires_grad_(False)
+    return create_solver(case.solver, **options).to(case.dtype)
 
 
 # --- problems ---------------------------------------------------------------------------------------------------------
@@ -254,25 +254,40 @@ def padding_is_nothing(case: Case) -> None:
 def units_are_free(case: Case) -> None:
     """World, pixels and weights may count in any unit, together with all that is measured in it."""
     call, _ = make(case)
-    length, pixel, weight = 1024.0, 0.25, 1e30 if case.dtype == torch.float64 else 1e6
+    pixel, weight = 0.25, 1e30 if case.dtype == torch.float64 else 1e6
     result = build(case)(**call)
-    scale = torch.tensor([pixel, pixel, 1.0], dtype=case.dtype)[:, None]
-    factors = {"world_points": length, "world_sigma": length, "world_cov": length**2}
-    factors |= {"intrinsics": scale, "img_sigma": pixel, "img_cov": pixel**2}
-    factors["img_points"] = 1.0 if case.camera == "bearings" else pixel
-    changed = {name: factors.get(name, 1.0) * x if isinstance(x, Tensor) else x for name, x in call.items()}
-    for name in {"init", "cam_from_rig"} & call.keys():
-        changed[name] = Pose(call[name].rotation, length * call[name].translation)
-    if "prior" in call:
-        unit = torch.tensor([1.0] * 3 + [length] * 3, dtype=case.dtype)
-        pose = Pose(call["prior"].pose.rotation, length * call["prior"].pose.translation)
-        changed["prior"] = PosePrior(pose, call["prior"].information / (unit * unit[:, None]), call["prior"].scale)
-    if case.is_ransac:  # whose threshold is in pixels
-        changed |= {name: x for name, x in call.items() if name.startswith("img") or name == "intrinsics"}
-        scale = torch.ones_like(scale)
-    found = build(case)(**changed, weights=torch.full_like(call["world_points"][..., 0], weight))
-    back = {"translation": found.translation / length, "intrinsics": found.intrinsics / scale}
-    assert_near(found._replace(**back, weights=found.weights / weight), result)
+    for length in (2.0**-40, 2.0**60):
+        scale = torch.tensor([pixel, pixel, 1.0], dtype=case.dtype)[:, None]
+        factors = {"world_points": length, "world_sigma": length, "world_cov": length**2}
+        factors |= {"intrinsics": scale, "img_sigma": pixel, "img_cov": pixel**2}
+        factors["img_points"] = 1.0 if case.camera == "bearings" else pixel
+        changed = {name: factors.get(name, 1.0) * x if isinstance(x, Tensor) else x for name, x in call.items()}
+        for name in {"init", "cam_from_rig"} & call.keys():
+            changed[name] = Pose(call[name].rotation, length * call[name].translation)
+        if "prior" in call:
+            unit = torch.tensor([1.0] * 3 + [length] * 3, dtype=case.dtype)
+            pose = Pose(call["prior"].pose.rotation, length * call["prior"].pose.translation)
+            changed["prior"] = PosePrior(pose, call["prior"].information / unit / unit[:, None], call["prior"].scale)
+        if case.is_ransac:  # whose threshold is in pixels
+            changed |= {name: x for name, x in call.items() if name.startswith("img") or name == "intrinsics"}
+            scale = torch.ones_like(scale)
+        found = build(case)(**changed, weights=torch.full_like(call["world_points"][..., 0], weight))
+        back = {"translation": found.translation / length, "intrinsics": found.intrinsics / scale}
+        assert_near(found._replace(**back, weights=found.weights / weight), result)
+
+
+def reflections_are_free(case: Case) -> None:
+    """A negative focal length reflects an axis of the image. If the pixels follow, nothing else changes."""
+    call, _ = make(case)
+    result = build(case)(**call)
+    for signs in ((-1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, -1.0, 1.0)):
+        flip = torch.tensor(signs, dtype=case.dtype)
+        factors = {"intrinsics": flip[:, None]}
+        if case.camera != "bearings":  # a camera of bearings is only a unit
+            factors |= {"img_points": flip[:2], "img_cov": flip[:2, None] * flip[:2]}
+        changed = {name: factors.get(name, 1.0) * x if isinstance(x, Tensor) else x for name, x in call.items()}
+        found = build(case)(**changed)
+        assert_same(found._replace(intrinsics=flip[:, None] * found.intrinsics), result)
 
 
 def frames_are_free(case: Case) -> None:
@@ -332,7 +347,7 @@ BAD: dict[str, tuple[str, Callable[[Call, int], None]]] = {
     "negative information": ("prior", lambda call, i: call["prior"].information[i, 5, 5].fill_(-1.0)),
     "lopsided information": ("prior", lambda call, i: call["prior"].information[i, 0, 1].fill_(1e5)),
     "prior without scale": ("prior", lambda call, i: call["prior"].scale[i].fill_(0.0)),
-    "impossible confidence": ("confidence", _put("confidence", 4, 1.1)),
+    "confidence in percent": ("confidence", _put("confidence", ..., 95.0)),
     "nan start": ("init", lambda call, i: call["init"].rotation[i, 0, 0].fill_(math.nan)),
 }
 
@@ -431,6 +446,17 @@ def half_precision_is_converted(case: Case) -> None:
         assert_same(one, other.to(leaf.dtype), atol=size)
 
 
+def defaults_are_free(case: Case) -> None:
+    """PyTorch's default dtype and default device change no bit."""
+    call, _ = make(case)
+    call |= {"alternatives": 1} if case.camera == "pixels" and case.solver not in PEERS else {}
+    solver = build(case)
+    expected = solver(**call)
+    with other_defaults(torch.float64 if case.dtype == torch.float32 else torch.float16):
+        found = solver(**call)
+    assert_same(found, expected)
+
+
 def copies_are_the_same(case: Case) -> None:
     """Copied and pickled; saved and loaded again, unless it is a sampler."""
     call, _ = make(case)
@@ -475,11 +501,13 @@ LAWS = (
     shuffled_is_ordered,
     padding_is_nothing,
     units_are_free,
+    reflections_are_free,
     frames_are_free,
     bad_problems_fail_alone,
     gradients_reach_the_inputs,
     isotropic_covariances_are_sigmas,
     half_precision_is_converted,
+    defaults_are_free,
     copies_are_the_same,
     wrong_arguments_are_refused,
 )
@@ -494,7 +522,13 @@ def applies(law: Callable[[Case], None], case: Case) -> bool:
     if law is isotropic_covariances_are_sigmas:
         return case.noise == "sigma"
     if case.solver in PEERS:
-        return law in (batches_are_free, half_precision_is_converted, wrong_arguments_are_refused)
+        return law in (
+            batches_are_free,
+            reflections_are_free,
+            defaults_are_free,
+            half_precision_is_converted,
+            wrong_arguments_are_refused,
+        )
     if case.solver.startswith("net-"):
         return law not in (gradients_reach_the_inputs, padding_is_nothing) and law not in OF_BELIEVED
     samples = case.is_ransac or (case.focal == "unknown" and case.solver != "pnpnet-set")

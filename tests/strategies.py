@@ -54,7 +54,6 @@ NO_POSE = {
     "infinite pixel": _entry(1, INF),
     "nan focal length": _entry(2, NAN),
     "no focal length": _entry(2, 0.0),
-    "negative focal length": _entry(2, -500.0),
     "one point": lambda world, img, camera: (world[:1].expand_as(world), img, camera),
     "a line": lambda world, img, camera: (world[:, :1].expand_as(world), img, camera),
 }
@@ -66,6 +65,7 @@ STRANGE = {
     "a huge number": _entry(0, 1e30),
     "a huge pixel": _entry(1, 1e9),
     "a tiny world": lambda world, img, camera: (1e-30 * world, img, camera),
+    "negative focal length": _entry(2, -500.0),
     "mirrored pixels": lambda world, img, camera: (world, -img, camera),
     "all points twice": lambda world, img, camera: (world[[i // 2 for i in range(len(world))]], img, camera),
 }

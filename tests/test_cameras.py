@@ -11,10 +11,12 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_p
 from kornia.geometry.linalg import inverse_transformation, transform_points
 from torch.nn import functional
 
-from kornia_pnpnet import PnPNet, Pose, create_solver, solve_pnp
+from kornia_pnpnet import PnPNet, Pose, create_solver, monte_carlo_pose_loss, pose_covariance, solve_pnp
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.losses import SetLoss
 from kornia_pnpnet.metrics import pose_errors
 from kornia_pnpnet.problem import Noise
 
@@ -116,7 +118,7 @@ def test_a_bad_lens_fails_alone_and_has_no_gradient(bad, lens, uniform):
     for x in leaves:
         x.requires_grad_()
     points, distorted, camera, given, sigma = leaves
-    result = create_solver("epnp-lm").requires_grad_(False)(points, distorted, camera, img_sigma=sigma, **{lens: given})
+    result = create_solver("epnp-lm")(points, distorted, camera, img_sigma=sigma, **{lens: given})
     assert result.ok.tolist() == [True, False, True]
     for gradient in torch.autograd.grad(result.matrix.sum() + result.cost.sum(), leaves):
         assert gradient.isfinite().all()
@@ -150,6 +152,50 @@ def test_the_noise_goes_through_the_lens(uniform):
     expected = Symmetric2.of(jacobian @ cov @ jacobian.mT)
     torch.testing.assert_close(tuple(found.img_cov), tuple(expected), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.img, (0.5 * jacobian.square().sum((-1, -2))).sqrt(), rtol=1e-5, atol=1e-6)
+
+
+SIGNS = [(-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)]
+
+
+@pytest.mark.parametrize("signs", SIGNS)
+@pytest.mark.parametrize("lens", ["dist", "fisheye"])
+def test_lenses_of_negative_focal_lengths(lens, signs, uniform):
+    """Undistorted pixels and covariances are reflected; bearings and poses are the same."""
+    points, pixels, pose = seen(uniform, 2, 9)
+    distorted, given = distort(pixels, lens)
+    flip = torch.tensor([*signs, 1.0], dtype=torch.float64)
+    camera, cov = flip[:, None] * CAMERA, torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    assert torch.equal(bearings(flip[:2] * distorted, camera, **given), bearings(distorted, CAMERA, **given))
+    result = create_solver("pnpnet-set")(points, flip[:2] * distorted, camera, **given)
+    assert right(result, pose, 0.1, 0.01).all()
+    lenses = [x if x is None else x.expand(2, -1) for x in map(given.get, ("dist", "fisheye"))]
+    one, turned = torch.ones(2, 9, dtype=torch.float64), flip[:2, None] * flip[:2] * cov
+    noises = [Noise(one, one, Symmetric2.of(x.expand(2, 9, 2, 2))) for x in (cov, turned)]
+    expected = undistort(distorted, CAMERA.expand(2, 3, 3), *lenses, noises[0])
+    found = undistort(flip[:2] * distorted, camera.expand(2, 3, 3), *lenses, noises[1])
+    torch.testing.assert_close(found[0], flip[:2] * expected[0], rtol=0, atol=0)
+    torch.testing.assert_close(found[2].img, expected[2].img)
+    uu, uv, vv = expected[2].img_cov
+    torch.testing.assert_close(tuple(found[2].img_cov), (uu, signs[0] * signs[1] * uv, vv))
+
+
+@pytest.mark.parametrize("signs", SIGNS)
+def test_covariances_and_losses_of_negative_focal_lengths(signs, make_problems):
+    p, flip = make_problems(batch=3, outliers=2), torch.tensor([*signs, 1.0], dtype=torch.float64)
+    reflected = p._replace(img_points=flip[:2] * p.img_points, intrinsics=flip[:, None] * p.intrinsics)
+    cov = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64).expand(3, 9, 2, 2)
+    outcomes = []
+    for q, noise in ((p, cov), (reflected, flip[:2, None] * flip[:2] * cov)):
+        torch.manual_seed(0)
+        img = q.img_points.clone().requires_grad_()
+        losses = monte_carlo_pose_loss(q.pose, q.pose, q.world_points, img, q.intrinsics, img_cov=noise)
+        (gradient,) = torch.autograd.grad(losses.sum(), img)
+        gradient = gradient if q is p else flip[:2] * gradient
+        covariance = pose_covariance(q.pose, *q[:3], img_cov=noise, world_sigma=0.05, focal="unknown")
+        result, guess = create_solver("pnpnet-set").with_starts(*q[:3], img_sigma=1.0)
+        bound = KnownInliersAndNoise().solve_with_truth(q)
+        outcomes.append((losses, gradient, covariance, SetLoss()(result, q, 1.0, guess), bound.pose))
+    torch.testing.assert_close(*outcomes, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("lens", ["dist", "fisheye"])
@@ -219,6 +265,20 @@ def rig(uniform, batch, n, cameras, base, outliers=0):
     pose = poses(uniform, batch)
     pixels[:, :outliers] = uniform(batch, outliers, 2, low=0.0, high=640.0)
     return to_world(rig_points, pose), pixels, intrinsics, places, pose
+
+
+@pytest.mark.parametrize("options", [{}, {"effort": "fixed"}])
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm"])
+@pytest.mark.parametrize("camera", ["bearings", 0.0, 0.1, 0.6])
+def test_four_pairs_all_around(camera, name, options, uniform):
+    """Four bearings in every direction, or one pair in each of four cameras that look to four sides."""
+    if camera == "bearings":
+        points, rays, pose = everywhere(uniform, 100, 4)
+        result = create_solver(name, **options)(points, rays, None)
+    else:
+        points, pixels, intrinsics, places, pose = rig(uniform, 100, 4, 4, camera)
+        result = create_solver(name, **options)(points, pixels, intrinsics, cam_from_rig=places)
+    assert right(result, pose, 0.05, 0.01).all()
 
 
 @pytest.mark.parametrize("base", [0.02, 0.5])

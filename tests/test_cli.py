@@ -99,15 +99,22 @@ def test_solve_prints_what_the_library_returns(capsys, csv_file, problem, weight
     with torch.no_grad():
         result = load_solver(name)(world, img, K)
     assert (got["solver"], got["n"], got["ok"], got["cost"]) == (name, 9, result.ok.item(), result.cost.item())
+    known = got["inliers"], got["sigma_px"], got["probability"]
+    assert known == (result.inliers.sum().item(), result.sigma.item(), result.probability.item())
+    if got["ok"]:
+        sigmas = result.covariance(world, img, K)[0].diagonal().sqrt()
+        expected = [math.radians(x) for x in got["rotation_sigma_deg"]] + got["translation_sigma"]
+        assert expected == pytest.approx(sigmas.tolist())
     fields = got["rotation"], got["translation"], got["quaternion_wxyz"]
     assert fields == tuple(x[0].tolist() for x in (*result.pose, result.pose.quaternion))
     assert [pair["weight"] for pair in got["pairs"]] == result.weights[0].tolist()
     cam = world @ result.rotation.mT + result.translation[:, None]
     pixels = cam[0, :, :2] / cam[0, :, 2:] * K.diagonal()[:2] + K[:2, 2]
-    for pair, point, error in zip(got["pairs"], cam[0], (pixels - img[0]).norm(dim=-1), strict=True):
+    errors = (pixels - img[0]).norm(dim=-1)
+    for pair, point, error, inlier in zip(got["pairs"], cam[0], errors, result.inliers[0], strict=True):
         if point[2] > 0:
             assert pair["reprojection_error_px"] == pytest.approx(error.item())
-            assert pair["rejected"] == (not got["ok"] or error.item() > got["rejected_above_px"])
+            assert pair["rejected"] == (not got["ok"] or not inlier)
         else:
             assert pair == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
 
@@ -118,8 +125,6 @@ def test_solve_rejects_and_draws_outliers(capsys, csv_file, tmp_path):
     got = answer(capsys, csv_file, *common, "--plot", picture)
     assert [pair["rejected"] for pair in got["pairs"]] == [i in (1, 6) for i in range(9)]
     np.testing.assert_allclose(got["rotation"], np.eye(3), atol=5e-3)
-    errors = sorted(pair["reprojection_error_px"] for pair in got["pairs"])
-    assert got["rejected_above_px"] == max(3.0, 3 * 1.4826 * errors[4])
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert picture.stat().st_size > 10_000
     with csv_file.open("a") as file:
@@ -127,6 +132,40 @@ def test_solve_rejects_and_draws_outliers(capsys, csv_file, tmp_path):
     *others, behind = answer(capsys, csv_file, *common, "--threshold", "1e6")["pairs"]
     assert behind == {"weight": 0.0, "reprojection_error_px": None, "rejected": True}
     assert not any(pair["rejected"] for pair in others)
+
+
+def test_implausible_answers_say_which_test_failed(capsys, tmp_path, csv_file):
+    common = ("solve", csv_file, "--intrinsics", CAMERA)
+    assert run(capsys, *common)[2] == ""
+    world = points(40)
+    noise = np.random.default_rng(2).normal(0, 0.3, (40, 2))
+    img = seen(world) + noise
+    img[:22] = np.random.default_rng(3).uniform((0, 0), (640, 480), (22, 2))
+    for pixels, code, expected in (
+        (img, 0, " of 40 corresp"),
+        (img[:, ::-1], 1, ""),
+        (seen(world)[:, ::-1], 1, " px of "),
+    ):
+        table = np.concatenate((world, pixels), 1)
+        np.savetxt(csv_file, table, delimiter=",", header="X,Y,Z,u,v", comments="")
+        got = run(capsys, *common)
+        assert got[0] == code
+        assert got[2].count("\n") == 1
+        assert expected in got[2]
+        assert "swapped columns" in got[2]
+    assert answer(capsys, *common[1:], "--diagnose")["diagnosis"].startswith("swap u and v: 100 % of the pairs")
+
+
+def test_a_terminal_gets_a_table_and_a_pipe_gets_json(capsys, monkeypatch, csv_file):
+    common = ("solve", csv_file, "--intrinsics", CAMERA)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    _, table, _ = run(capsys, *common, "--focal", "unknown")
+    got = json.loads(run(capsys, *common, "--focal", "unknown", "--json")[1])
+    rows = dict(line.split(None, 1) for line in table.splitlines())
+    assert rows["inliers"] == f"{got['inliers']} of 9"
+    assert rows["sigma"] == f"{got['sigma_px']:.3g} px"
+    assert rows["translation"].count("±") == rows["rotation"].count("±") == rows["focal"].count("±") == 1
+    assert got["focal_sigma_px"] > 0
 
 
 def test_csv_in_any_column_order_and_npz_give_the_same(capsys, tmp_path, problem, csv_file):
@@ -162,6 +201,13 @@ def test_no_pose_is_exit_code_one_with_the_reason(capsys, tmp_path):
         assert got["rotation"] == torch.eye(3).tolist()
     _, _, err = run(capsys, "solve", path, "--intrinsics", CAMERA)
     assert err.startswith("pnpnet: not solved (degenerate)")
+    geocentric = {"world_points": 4e6 + points(), "img_points": seen(points())}
+    for dtype, reason in (np.float64, ""), (np.float32, "(precision): "):
+        np.savez(tmp_path / "far.npz", **{name: array.astype(dtype) for name, array in geocentric.items()})
+        code, _, err = run(capsys, "solve", tmp_path / "far.npz", "--intrinsics", CAMERA)
+        assert code == bool(reason)
+        assert reason in err
+    assert "float64" in err
 
 
 # -- bad input -------------------------------------------------------------------------------------------------------
@@ -198,12 +244,13 @@ def test_bad_npz_files(capsys, tmp_path):
     for changed, expected in (
         ({"img_points": None}, "img_points"),
         ({"img_points": np.ones((5, 2))}, "img_points must hold numbers of the shape (4, 2), got float64 of (5, 2)"),
+        ({"world_points": np.ones((1, 4, 3)), "img_points": np.ones((1, 4, 2))}, "pass --batch"),
         ({"world_points": np.ones(())}, "world_points must hold numbers"),
         ({"world_points": np.array([{}], dtype=object)}, "not an NPZ file of numbers"),
         ({"world_points": np.ones((0, 3)), "img_points": np.ones((0, 2))}, "at least 3 correspondences, got 0"),
         ({"img_points": np.array([[0, 0], [1, 1], [0, math.nan], [2, 2]])}, "img_points[2] must be finite"),
         ({"weights": np.array([1, 1, -2.0, 1])}, "weights[2] must be finite and at least 0"),
-        ({"intrinsics": np.diag([1.0, -1.0, 1.0])}, "focal lengths must be positive, got 1 and -1"),
+        ({"intrinsics": np.diag([1.0, 0.0, 1.0])}, "focal lengths must not be 0, got 1 and 0"),
         ({"intrinsics": np.eye(3) + np.eye(3, k=-1)}, "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"),
         ({}, "--intrinsics"),
     ):
@@ -216,9 +263,9 @@ def test_bad_npz_files(capsys, tmp_path):
         assert f"{path}: not an NPZ file" in refused(capsys, "solve", path, "--intrinsics", CAMERA)
 
 
-def test_cameras_with_skew_and_scale(capsys, tmp_path):
+def test_cameras_with_skew_scale_and_y_up(capsys, tmp_path):
     """Reprojections of the command use the whole matrix, as the solver does."""
-    camera = 2.0 * np.array([[800.0, 150.0, 320.0], [0.0, 810.0, 240.0], [0.0, 0.0, 1.0]])
+    camera = 2.0 * np.array([[800.0, 150.0, 320.0], [0.0, -810.0, 240.0], [0.0, 0.0, 1.0]])
     img = points(12) @ camera.T
     np.savez(tmp_path / "skew.npz", world_points=points(12), img_points=img[:, :2] / img[:, 2:], intrinsics=camera)
     got = answer(capsys, tmp_path / "skew.npz")
@@ -241,7 +288,7 @@ def test_export_takes_two_suffixes_and_overwrites_nothing(capsys, tmp_path, name
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"mine.onnx": "mine", "mine.pt2": "mine"}
 
 
-BAD_CAMERAS = ("1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,-1,320,240", "8,8,nan,2")
+BAD_CAMERAS = ("1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,0,320,240", "8,8,nan,2")
 PINHOLE = "PINHOLE,640,480,800,810,320,240"
 
 
@@ -251,6 +298,8 @@ PINHOLE = "PINHOLE,640,480,800,810,320,240"
         *((f"--intrinsics={camera}", "pnpnet: --intrinsics: ") for camera in BAD_CAMERAS),
         (f"--intrinsics {CAMERA} --camera {PINHOLE}", "--camera stands alone"),
         ("--camera PINHOLE,640,480,800", "--camera: expected MODEL"),
+        (f"--intrinsics {CAMERA} --focal 0.1 --diagnose", "--diagnose needs a known focal length"),
+        (f"--intrinsics {CAMERA} --batch --json", "--json"),
         (f"--intrinsics {CAMERA} --focal unknown --solver poselib", "does not estimate focal lengths"),
         *((f"--solver {name}", name) for name in ("nobody", "tests")),
         ("--solver opencv-ransac:speed=9", "speed"),
@@ -274,13 +323,20 @@ def test_files_of_another_n_and_no_files(capsys, csv_file, tmp_path, weights_fol
 
 @pytest.mark.parametrize(
     "arguments",
-    ["", "fly", "solve", f"solve {__file__} --threshold 0", f"solve {__file__} --focal=-1", "evaluate --n 9,"],
+    [
+        "",
+        "fly",
+        "solve",
+        *(f"solve {__file__} --{x}" for x in ("threshold 0", "focal=-1", "focal 1200")),
+        "evaluate --n 9,",
+    ],
 )
 def test_wrong_usage_is_one_line(capsys, arguments):
     with pytest.raises(SystemExit) as stopped:
         main(arguments.split())
     err = capsys.readouterr().err
     assert (stopped.value.code, err[:8], err.count("\n")) == (2, "pnpnet: ", 1)
+    assert "1200" not in arguments or "--intrinsics 1200,1200,cx,cy" in err
 
 
 def test_help_and_version(capsys):

@@ -167,3 +167,12 @@ def test_eigenvectors_are_orthonormal_and_nearly_diagonalise(generator):
     assert (error < 1e-2).all()
     assert error.median() < 1e-9
     torch.testing.assert_close(values, values.sort(-1).values)
+
+
+@pytest.mark.parametrize("count", [1, 2000])
+def test_gradients_are_finite_for_any_size_of_the_matrix(count):
+    for size in (1e-38, 1e-30, 1e-20, 1e-15, 1.0, 1e15):
+        matrix = (size * torch.eye(6)[..., None].repeat(1, 1, count)).requires_grad_()
+        solution, _ = solve_positive(matrix, torch.full((6, count), size), torch.tensor(0.0))
+        (0.0 * solution).sum().backward()
+        assert matrix.grad.isfinite().all()

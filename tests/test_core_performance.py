@@ -75,7 +75,7 @@ def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, bac
 
 @pytest.mark.parametrize(("views", "whole"), [pytest.param(1, False, marks=pytest.mark.slow), (2, True)])
 def test_results_and_gradients_are_those_of_the_eager_solver(views, whole, backend):
-    solver = create_solver("pnpnet-n9", m=1).double()
+    solver = create_solver("pnpnet-n9", m=1).double().requires_grad_()
     solver.views = views
     compiled = copy.deepcopy(solver)
     compiled.compile(whole=whole)

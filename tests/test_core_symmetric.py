@@ -45,7 +45,7 @@ def test_the_calculus_of_three():
     matrix, vector = matrices(3), torch.randn(200, 3, dtype=torch.float64)
     symmetric = Symmetric3.of(matrix)
     torch.testing.assert_close(torch.stack(symmetric.times(vector.mT), -1), (matrix @ vector[..., None])[..., 0])
-    torch.testing.assert_close(full(symmetric.scaled(vector[:, 0])), matrix * vector[:, :1, None])
+    torch.testing.assert_close(full(symmetric.divided(vector[:, 0])), matrix / vector[:, :1, None].square())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -99,6 +99,20 @@ def test_gradients(make_problems):
     assert not line.grad[0].any()
 
 
+def test_an_unknown_focal_length_is_that_of_the_result(make_problems):
+    """The solver's call may give any focal length; the covariance of the pose is not computed with it."""
+    p = make_problems(n=20, batch=3)
+    nominal = p.intrinsics / torch.tensor([3400.0, 3400.0, 1.0]).double()[:, None]
+    result = create_solver("p3p-ransac", focal="unknown")(*p[:2], nominal, img_sigma=1.0)
+    assert result.ok.all()
+    noise = {"img_sigma": 1.0, "focal": "unknown"}
+    weights = result.inliers.double()
+    expected = pose_covariance(result.pose, *p[:2], result.intrinsics, **noise, weights=weights)
+    assert expected.isfinite().all()
+    torch.testing.assert_close(result.covariance(*p[:2], nominal, **noise), expected)
+    assert pose_covariance(result.pose, *p[:2], nominal, **noise).diagonal(dim1=1, dim2=2).isinf().all()
+
+
 def test_a_prior_adds_its_information(make_problems):
     p = make_problems(n=8, batch=5)
     far = p._replace(world_points=p.world_points + 100.0)  # in the frame of the caller, not of the centroid

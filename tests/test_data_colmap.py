@@ -147,7 +147,7 @@ def test_missing_models(tmp_path, monkeypatch):
         load_scene(tmp_path)
     (tmp_path / "points3D.txt").write_text("")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(ImportError, match=r"pip install 'kornia_pnpnet\[eval\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[eval\]'"):
         load_scene(tmp_path)
 
 

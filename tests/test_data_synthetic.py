@@ -10,7 +10,15 @@ from data_helpers import COUNT, assert_normal, assert_uniform, draw, make_scene,
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import CameraProblems, FacadePoints, ObjectPoints, OutlierMix, SceneProblems, SyntheticProblems
+from kornia_pnpnet.data import (
+    CameraProblems,
+    DepthMaps,
+    FacadePoints,
+    ObjectPoints,
+    OutlierMix,
+    SceneProblems,
+    SyntheticProblems,
+)
 
 
 def test_poses_are_uniform_in_the_box_in_axis_and_in_angle():
@@ -187,3 +195,36 @@ def test_confidences_tell_inliers_from_outliers_more_or_less():
     assert max(areas) > 0.95
     assert sum(areas) / len(areas) > 0.75
     assert set(p.known) == {"confidence"}
+
+
+def test_depth_maps_move_points_along_map_rays_and_make_outliers_of_flying_pixels():
+    maps = partial(DepthMaps, angle=(1e-9, 2e-9), flying_share=0.0)
+    clean, noisy = (
+        draw(9, world_sigma=0.0, img_sigma=0.0, depth_maps=x) for x in (None, maps(depth_noise=(0.01, 0.011)))
+    )
+    assert noisy.inliers.all()
+    moves = (noisy.world_points - clean.world_points).norm(dim=-1)
+    distance = clean.true_cam_points.norm(dim=-1)
+    near, far = (moves[chosen].square().mean().sqrt() for chosen in (distance < 40, distance > 80))
+    assert 2.5 < far / near < 7.0  # about the square of the distances' ratio
+    problems = draw(9, depth_maps=maps(flying_share=0.2, depth_noise=(0.01, 0.011)))
+    assert abs(problems.inliers.double().mean() - 0.8) < 0.01
+
+
+def test_a_map_turns_all_of_its_points():
+    maps = DepthMaps(depth_noise=(1e-9, 2e-9), angle=(0.5, 0.51), flying_share=0.0, maps=1)
+    clean, noisy = (draw(9, world_sigma=0.0, img_sigma=0.0, depth_maps=x) for x in (None, maps))
+    before, after = (torch.cdist(x.world_points, x.world_points) for x in (clean, noisy))
+    torch.testing.assert_close(before, after, rtol=1e-3, atol=1e-6)
+    assert (noisy.world_points - clean.world_points).norm(dim=-1).mean() > 0.1
+
+
+def test_copies_are_whole_pairs_and_leave_eight_originals():
+    problems = draw(30, sigma_spread=0.5, known_noise=1.0, confidence_share=1.0, copies_share=1.0)
+    distances = partial(torch.cdist, compute_mode="donot_use_mm_for_euclid_dist")
+    same_point = distances(problems.world_points, problems.world_points) == 0
+    copied = same_point.sum(-1) > 1
+    assert 0.2 < copied.double().mean() < 0.6
+    for x in (problems.img_points, problems.img_sigma[..., None], problems.confidence[..., None]):
+        assert (distances(x, x)[same_point] == 0).all()
+    assert (same_point[:, :8, :8].sum(-1) == 1).all()

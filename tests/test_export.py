@@ -3,11 +3,13 @@
 import math
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import torch._inductor.config
 from kornia.core.exceptions import BaseError, ShapeError, ValueCheckError
 
 from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, SetInit, create_solver
@@ -147,6 +149,17 @@ def test_solvers_that_the_command_cannot_export(tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("name", "missing"), [("x.onnx", "onnx"), ("x.onnx", "onnxscript"), ("x.pt2", "compiler")])
+def test_what_an_export_needs_is_checked_before_it_starts(name, missing, tmp_path, monkeypatch, capsys):
+    if missing != "compiler":
+        monkeypatch.setitem(sys.modules, missing, None)
+    with torch._inductor.config.patch("cpp.cxx", ("no-such-compiler",)):
+        assert main(["export", str(tmp_path / name)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "C++ compiler" in err if missing == "compiler" else "pip install '.[onnx]'" in err
+
+
 # -- ahead-of-time packages --------------------------------------------------------------------------------------------
 
 
@@ -230,12 +243,12 @@ def test_cpp_example(make_problems, tmp_path):
     assert "n = 9" in refused.stderr
 
 
-def test_a_package_needs_its_suffix_and_a_compiler(tmp_path, monkeypatch):
+def test_a_package_needs_its_suffix_and_a_compiler(tmp_path):
     solver = PnPNet(None, RobustWeightedLM(1))
     with pytest.raises(ValueCheckError, match=r"\.pt2"):
         export_package(solver, tmp_path / "model.so", 9)
-    monkeypatch.setattr("torch._inductor.config.cpp.cxx", ("no-such-compiler",))
-    with pytest.raises(ImportError, match="compiler"):
+    no_compiler = torch._inductor.config.patch("cpp.cxx", ("no-such-compiler",))
+    with no_compiler, pytest.raises(ImportError, match="compiler"):
         export_package(solver, tmp_path / "model.pt2", 9)
 
 

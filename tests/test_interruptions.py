@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import random
-import resource
 import shutil
 import signal
 import sys
@@ -23,6 +22,8 @@ from kornia_pnpnet.cli import main
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.training import fit
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME
+
+resource = pytest.importorskip("resource", reason="not on Windows")
 
 KILLS = 20
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.

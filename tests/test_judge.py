@@ -14,10 +14,9 @@ from kornia.geometry.linalg import transform_points
 from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.judge.belief import LAW, LEAST_PROBABILITY
-from kornia_pnpnet.judge.evidence import copies, evidence, votes
+from kornia_pnpnet.judge.evidence import at_pose, copies, evidence, votes
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Noise, Problem, State
-from kornia_pnpnet.refine.residual import project
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "docs" / "results"))
@@ -44,7 +43,7 @@ def scene(pairs, outliers, sigma, seed=0, batch=50):
 
 def found(problem, pose, known=False):
     known = torch.full_like(problem.weights[:, :1], float(known)).bool()
-    return evidence(project(State.of(pose), problem), problem, votes(problem), known)
+    return evidence(at_pose(State.of(pose), problem), problem, votes(problem), known)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.5, 3.0, 12.0])
@@ -104,8 +103,8 @@ def test_an_inlier_is_within_the_thresholds_of_pixel_and_point():
         torch.zeros(1, 4, 2),
         100.0,
     )
-    projection = project(State.of(Pose(torch.eye(3)[None], torch.zeros(1, 3))), problem)
-    judged = judge(projection, problem, Thresholds(torch.tensor([[10.0]]), torch.tensor([[0.2]])))
+    seen = at_pose(State.of(Pose(torch.eye(3)[None], torch.zeros(1, 3))), problem)
+    judged = judge(seen.projection, problem, Thresholds(torch.tensor([[10.0]]), torch.tensor([[0.2]])))
     torch.testing.assert_close(judged.errors[0, :3], torch.tensor([0.0, 25.0, 144.0]) / 125.0)
     torch.testing.assert_close(judged.weights, torch.tensor([[0.8, 0.8, 0.0, 0.0]]))
     assert judged.inliers.tolist() == [2]
@@ -179,6 +178,22 @@ def test_probability_is_observed_as_often():
     sure = result.probability >= LEAST_PROBABILITY
     assert near[sure].double().mean() > 0.95
     assert near[~sure].double().mean() < near[sure].double().mean() - 0.2
+
+
+def test_a_result_prints_in_five_lines():
+    p = SyntheticProblems(n=12, batch_size=4, seed=3, outliers=OutlierMix(count=2)).batch(0)
+    solver = create_solver("epnp-lm")
+    with torch.no_grad():
+        many = solver(torch.where(torch.arange(4)[:, None, None] == 1, torch.nan, p.world_points), *p[1:3])
+        single = solver(*(x[0] for x in p[:3]))
+    for result, expected in ((many, "NOT_FINITE"), (single, "rotation vector"), (many._replace(sigma=None), "tensor")):
+        assert expected in repr(result)
+        assert (repr(result).count("\n") == 4) == (result.sigma is not None)
+    assert f"sigma {single.sigma:.4g} px" in repr(single)
+    assert f"inliers {single.inliers.sum()} of 12" in repr(single)
+    meta = solver(*(x.to("meta") for x in p[:3]))
+    assert "meta" in repr(meta)
+    torch.func.vmap(lambda x: (repr(single._replace(sigma=x)), x)[1])(torch.ones(2))
 
 
 def test_the_law_is_that_of_the_results_file():

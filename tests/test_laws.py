@@ -5,16 +5,36 @@ from itertools import product
 import pytest
 import torch
 from data_helpers import make_scene, same
-from helpers import assert_same
+from helpers import assert_same, other_defaults
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
 from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gradcheck, make
 from strategies import many
 
-from kornia_pnpnet import heatmap_keypoints
+from kornia_pnpnet import (
+    PoseLoss,
+    SetLoss,
+    create_solver,
+    depth_points,
+    heatmap_keypoints,
+    monte_carlo_pose_loss,
+    pose_covariance,
+    pose_errors,
+    success,
+)
+from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.data import BoxPoints, DrivePoints, OutlierMix, SceneProblems, SlabPoints, SyntheticProblems
+from kornia_pnpnet.data import (
+    BoxPoints,
+    CameraProblems,
+    DrivePoints,
+    OutlierMix,
+    SceneProblems,
+    SlabPoints,
+    SyntheticProblems,
+    VaryingSize,
+)
 
 SOLVERS = ("pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac", "identity-lm")
 ALL = [Case(*x) for x in product(SOLVERS, CAMERAS, NOISES, FOCALS, (torch.float64, torch.float32))]
@@ -87,3 +107,59 @@ def test_both_precisions_see_the_same_problems(points, n, seed, outliers):
 def test_heat_maps_of_half_precision_are_those_of_float32(dtype, generator):
     heatmaps = torch.randn(1, 2, 4, 5, generator=generator).to(dtype)
     assert_same(heatmap_keypoints(heatmaps), heatmap_keypoints(heatmaps.float()))
+
+
+# --- PyTorch's defaults -----------------------------------------------------------------------------------------------
+
+EVERY_KIND = OutlierMix(
+    max_ratio=0.5, mismatch_share=0.3, structured_share=0.5, near_share=0.2, crowd_share=0.3, point_crowd_share=0.5
+)
+
+
+def every_function(dtype):
+    """Results of the functions beside the solvers for the same problems."""
+    problems = SyntheticProblems(n=12, batch_size=3, seed=1, dtype=dtype).batch(0)
+    points, pixels, camera, pose = problems[:4]
+    noise = {"img_sigma": 1.0, "world_sigma": 0.05}
+    result, starts = build(Case("pnpnet-set", dtype=dtype)).with_starts(points, pixels, camera, **noise)
+    torch.manual_seed(0)
+    yield monte_carlo_pose_loss(pose, result.pose, points, pixels, camera, **noise)
+    yield PoseLoss()(result, problems), SetLoss()(result, problems, 1.0, starts)
+    yield success(pose_errors(result.pose, pose))
+    yield pose_covariance(pose, points, pixels, camera, **noise, focal="unknown", focal_sigma=0.1)
+    yield (
+        depth_points(pixels, points[..., 2].abs() + 1.0, camera, pose, depth_sigma=0.1),
+        heatmap_keypoints(points[None]),
+    )
+    yield [bearings(pixels, camera, **{name: camera.new_zeros(4)}) for name in ("dist", "fisheye")]
+    yield result.pose.rvec, result.pose.quaternion, result.pose.camera(camera).camera_matrix
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_functions_do_not_depend_on_defaults(dtype):
+    expected = [*every_function(dtype)]
+    with other_defaults(torch.float64 if dtype == torch.float32 else torch.float16):
+        found = [*every_function(dtype)]
+    assert_same(found, expected)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        SyntheticProblems(n=9, batch_size=4, outliers=EVERY_KIND),
+        CameraProblems(n=9, batch_size=4, cameras=3),
+        VaryingSize(SyntheticProblems, n=[5, 9], batch_size=4),
+    ],
+)
+def test_problems_do_not_depend_on_defaults(source):
+    expected = source.batch(1)
+    with other_defaults(torch.float64):
+        assert_same(source.batch(1), expected)
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])
+def test_built_solvers_do_not_depend_on_the_default_dtype(name):
+    problems = SyntheticProblems(n=12, batch_size=3, seed=1).batch(0)
+    expected = create_solver(name)(*problems[:3])
+    with other_defaults(torch.float64, "cpu"):
+        assert_same(create_solver(name)(*problems[:3]), expected)

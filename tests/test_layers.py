@@ -23,7 +23,7 @@ LAYERS = (
     "cameras arguments frame data losses likelihood metrics covariance measurements propose pretrained",
     "solver",
     "registry peers __init__",
-    "training evaluation export arrow",
+    "training evaluation export arrow diagnosis",
     "cli",
 )
 
@@ -36,7 +36,7 @@ EXTRAS = (
 OWNERS = {
     "matplotlib": {"evaluation.plots"},
     "pandas": set(),
-    "hydra": set(),
+    "hydra": {"training.sweep"},
     "cv2": {"peers"},
     "kornia_rs": {"peers"},
     "pycolmap": {"data.colmap", "peers"},

@@ -67,7 +67,7 @@ def test_a_map_with_nan_spoils_its_own_problem_only(make_problems, generator):
 @pytest.mark.parametrize(
     ("heatmaps", "options"),
     [
-        (torch.zeros(2, 4, 4), {}),
+        (torch.zeros(4, 4), {}),
         (torch.zeros(1, 1, 4, 4, dtype=torch.bool), {}),
         (torch.zeros(1, 1, 4, 4), {"temperature": 0.0}),
         (torch.zeros(1, 1, 4, 4), {"stride": 0}),

@@ -87,8 +87,9 @@ def test_errors_of_any_numbers(value, dtype, random_rotations):
     assert right[2:].all()
     assert not right[errors.rotation_error_deg.isnan() | errors.translation_error.isnan()].any()
     assert 0 <= success_rate(right).low <= success_rate(right).rate <= success_rate(right).high <= 1
-    with pytest.raises(ValueError, match="at least one"):
-        success_rate(right[:0])
+    for refused in (right[:0], right.double()):
+        with pytest.raises(ValueError, match="at least one"):
+            success_rate(refused)
 
 
 @pytest.mark.parametrize(("rotation", "translation"), [((1, 3, 3), (2, 3)), ((2, 3, 3), (1, 3)), ((3, 3), (3,))])

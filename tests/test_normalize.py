@@ -54,7 +54,24 @@ def test_poses_go_to_the_frame_of_the_points_and_back_for_any_camera(fx, fy, cx,
     if options["center"] and options["scale"]:
         torch.testing.assert_close(problem.world_points.square().sum((1, 2)) / 9, torch.ones(7).double())
     if not options["scale"]:
-        assert torch.equal(frame.scale, torch.ones(7).double())
+        assert torch.equal(frame.size, torch.ones(7).double())
+
+
+@both_dtypes
+@pytest.mark.parametrize("power", [-100, 100])
+def test_the_unit_of_the_world_changes_neither_values_nor_gradients(power, dtype, make_problems):
+    """A power of two changes no digit. The far point, which is dropped in every unit, changes nothing either."""
+    p, outcomes = make_problems(outliers=2).map(lambda x: x.to(dtype) if x.is_floating_point() else x), []
+    for unit in (1.0, 2.0**power):
+        world = unit * p.world_points
+        world[:, 0] = 1e38
+        world.requires_grad_()
+        problem, frame = Normalize(order=False)(world, *p[1:3])
+        back = frame.undo(p.pose)
+        seen = problem.world_points.square().sum() + (back.translation / unit).sum()
+        gradient = unit * torch.autograd.grad(seen, world)[0]
+        outcomes.append((problem.world_points, frame.size / unit, back.translation / unit, gradient))
+    torch.testing.assert_close(*outcomes, rtol=0, atol=0)
 
 
 # --- validity ---------------------------------------------------------------------------------------------------------

@@ -14,8 +14,9 @@ from strategies import are_rotations, finite, gradients_are_finite, many, number
 
 from kornia_pnpnet import Pose, Status, create_solver
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.problem import Hypotheses
+from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.p3p import p3p
+from kornia_pnpnet.propose.p3p_rig import P3PRig
 
 DTYPES = (torch.float64, torch.float32)
 NEAR = 1e-6
@@ -151,10 +152,11 @@ def test_two_solutions_that_meet_are_not_lost(offset, generator):
     assert (reprojection_errors(found, world_points, plane_points) < 1e-9).all()
 
 
+@pytest.mark.parametrize("unit", [2.0**-90, 2.0**90])
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
-def test_single_precision_solves_what_it_can(scene):
+def test_single_precision_solves_what_it_can(scene, unit):
     world_points, plane_points, pose = scene(20_000)
-    found = p3p(world_points.float(), plane_points.float())
+    found = p3p(unit * world_points.float(), plane_points.float())
     assert found.pose.rotation.dtype == torch.float32
     finite(found)
     error = (found.pose.rotation - pose.rotation[:, None]).abs().amax((-1, -2))
@@ -192,6 +194,25 @@ def test_all_poses_of_three_pixels_with_any_leading_dimensions():
         expected = (x[:first].flatten(0, 1) for x in (*whole.pose, whole.valid))
         for one, other in zip((*flat.pose, flat.valid), expected, strict=True):
             assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("base", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize("looks", ["ahead", "everywhere"])
+def test_three_pairs_of_a_rig(base, looks, generator):
+    world_points, plane_points, pose = wide(5000)
+    turns = rotations(15_000, seed=5).view(5000, 3, 3, 3) if looks == "everywhere" else torch.eye(3).double()
+    rig = Pose(turns.expand(5000, 3, 3, 3), base * torch.randn(5000, 3, 3, generator=generator, dtype=torch.float64))
+    in_camera_of_pair = in_camera(Hypotheses(Pose(*(x[:, None] for x in pose)), None), world_points)[:, 0]
+    in_rig = (rig.rotation.mT @ (in_camera_of_pair - rig.translation)[..., None])[..., 0]
+    world_points = (in_rig - pose.translation[:, None]) @ pose.rotation
+    found = P3PRig().hypotheses(Problem.of(world_points, plane_points, rig=rig))
+    assert (errors(found, pose).amin(-1) < NEAR).double().mean() > 0.95
+    in_rig = in_camera(found, world_points)
+    cam_points = torch.einsum("bnij,bsnj->bsni", rig.rotation, in_rig) + rig.translation[:, None]
+    gap = (cam_points[..., :2] / cam_points[..., 2:] - plane_points[:, None]).norm(dim=-1).amax(-1)[found.valid]
+    assert (cam_points[found.valid][..., 2] > 0).all()
+    assert (gap < 1e-3).all()
+    assert (gap < 1e-9).double().mean() > 0.98
 
 
 @many(80)

@@ -62,7 +62,7 @@ def pose_term(expected, information, generator, scale=None):
     term, usable = PoseTerm.of(PosePrior(expected, information, scale), centroid, size)
     assert usable.all()
     turned = (expected.rotation * term.offset[:, None]).sum(-1)
-    torch.testing.assert_close(term.pose.translation, expected.translation * size[:, None] + turned)
+    torch.testing.assert_close(term.pose.translation, expected.translation / size[:, None] + turned)
     return term
 
 

@@ -126,7 +126,7 @@ def test_transforms_of_every_solver_of_ours(name):
     chosen = {"m": 2} if name.endswith("-lm") or "pnpnet-n" in name else {}
     chosen |= {"pnpnet-set": {"m": 8, "effort": "fixed"}, "ransac-epnp-lm": {"max_samples": 20}}.get(name, {})
     p = SyntheticProblems(n=int(number[1]) if number else 8, batch_size=2, seed=3, dtype=torch.float64).batch(0)
-    solver = create_solver(name, **chosen).double().requires_grad_(False)
+    solver = create_solver(name, **chosen).double()
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(3, *p.img_points.shape, generator=generator).double()
     mixture = torch.randn(24, generator=generator).double()

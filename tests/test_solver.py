@@ -7,21 +7,26 @@ import torch
 from helpers import assert_same, rate
 from kornia.core.exceptions import BaseError, ValueCheckError
 from safetensors.torch import save_file
+from torch.utils.data import DataLoader, Dataset
 
 from kornia_pnpnet import (
     MLPInit,
     Normalize,
     PnPNet,
     Pose,
+    PosePrior,
     RobustWeightedLM,
     SetInit,
     Starts,
+    Status,
     create_solver,
     list_solvers,
     pose_errors,
     solve_pnp,
 )
 from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
+from kornia_pnpnet.losses import pose_distances
+from kornia_pnpnet.pretrained import shipped_weights
 
 # --- effort -----------------------------------------------------------------------------------------------------------
 
@@ -140,6 +145,46 @@ def test_a_pose_that_is_not_ok_carries_a_gradient_on_request(name, make_problems
         solver(*p[:3], gradient="never")
 
 
+@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])
+def test_a_step_against_the_gradient_lowers_the_loss_of_problems_that_are_not_ok(name, generator):
+    p = SyntheticProblems(n=12, batch_size=128, seed=1, world_sigma=0.0, img_sigma=0.0).batch(0)
+    solver = create_solver(name, effort="fixed", gradient="always")
+    pixels = (p.img_points + 200.0 * torch.randn(p.img_points.shape, generator=generator)).requires_grad_()
+
+    def losses(img_points):
+        result = solver(p.world_points, img_points, p.intrinsics)
+        assert result.ok.float().mean() < 0.1
+        rotation, translation = pose_distances(result.pose, p.pose)
+        return rotation + translation / p.pose.translation.norm(dim=1)
+
+    before = losses(pixels)
+    (gradient,) = torch.autograd.grad(before.sum(), pixels)
+    step = 0.1 * gradient / gradient.flatten(1).norm(dim=1)[:, None, None]  # pixels
+    with torch.no_grad():
+        assert (losses(pixels - step) < before).float().mean() > 0.95
+
+
+def test_a_training_without_a_gradient_warns_once(make_problems, generator):
+    """Only where a gradient is needed, and not once a problem of the first batches was solved."""
+    p = make_problems()
+    wrong = (2000.0 * torch.rand(p.img_points.shape, generator=generator, dtype=torch.float64)).requires_grad_()
+    right = p.img_points.clone().requires_grad_()
+    solver = create_solver("pnpnet-set", effort="fixed")
+    for options in ({"gradient": "always"}, {"first_stage_only": True}):
+        for _ in range(10):
+            solver(p.world_points, wrong, p.intrinsics, **options)
+    for _ in range(10):
+        solver(p.world_points, wrong.detach(), p.intrinsics)
+    for _ in range(7):
+        solver(p.world_points, wrong, p.intrinsics)
+    with pytest.warns(RuntimeWarning, match="monte_carlo_pose_loss"):
+        solver(p.world_points, wrong, p.intrinsics)
+    solver(p.world_points, wrong, p.intrinsics)
+    solver = create_solver("pnpnet-set", effort="fixed")
+    for pixels in (wrong, right, *[wrong] * 8):
+        solver(p.world_points, pixels, p.intrinsics)
+
+
 @pytest.mark.parametrize(
     "name", ["p3p-ransac", "ransac-epnp-lm", "epnp", "reppnp", "epnp-lm", "pnpnet-set", "pnpnet-n9"]
 )
@@ -151,6 +196,66 @@ def test_a_given_pose_helps_and_does_no_harm(name, make_problems, perturb):
     close = perturb(p.pose, angle=1e-3, shift=1e-2)
     result = solver(*p[:3], init=close)
     assert (result.matrix - p.pose.matrix).norm() < 0.1 * (close.matrix - p.pose.matrix).norm()
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac"])
+def test_a_pair_is_left_out_if_its_confidence_is_no_probability(name, make_problems, generator):
+    p, solver = make_problems(12), create_solver(name)
+    confidence = torch.rand(7, 12, generator=generator, dtype=torch.float64)
+    weights = torch.ones_like(confidence)
+
+    def solved(value, weight=1.0):
+        changed, weighed = confidence.clone(), weights.clone()
+        changed[:, 3], weighed[:, 3] = value, weight
+        return solver(*p[:3], weighed, confidence=changed)
+
+    for rounded, value in ((1.0005, 1.0), (-0.0005, 0.0)):
+        assert_same(solved(rounded), solved(value))
+    for impossible in (1.1, -0.1, 95.0, torch.inf):
+        assert_same(solved(impossible), solved(0.5, weight=0.0))
+    percent = torch.where(weights.cumsum(1) < 3, confidence, 95.0)
+    assert (solver(*p[:3], confidence=percent).status == Status.CONFIDENCE).all()
+
+
+NO_ROTATIONS = {
+    "float16": lambda x: x.half().double(),
+    "similarity": lambda x: 1.02 * x,
+    "drifted": lambda x: x + 0.01 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0)).double(),
+}
+
+
+@pytest.mark.parametrize("kind", NO_ROTATIONS)
+def test_a_given_matrix_becomes_the_nearest_rotation(kind, make_problems):
+    p, solver = make_problems(), PnPNet(None)
+    changed = NO_ROTATIONS[kind](p.pose.rotation)
+    left, _, right = torch.linalg.svd(changed)
+    (given, nearest), known = (
+        (Pose(x, p.pose.translation) for x in (changed, left @ right)),
+        torch.eye(6).double().expand(7, 6, 6),
+    )
+    for found, expected in (
+        (solver(*p[:3], init=given), solver(*p[:3], init=nearest)),
+        (solver(*p[:3], prior=PosePrior(given, known)), solver(*p[:3], prior=PosePrior(nearest, known))),
+    ):
+        assert found.ok.all()
+        assert_same(found.pose, expected.pose, 1e-9, 1e-9)
+        assert_same(found.init, nearest, 1e-9, 1e-9)
+
+
+def test_a_given_matrix_has_the_gradient_of_the_nearest_rotation(make_problems):
+    p = make_problems(batch=2)
+    matrix = (1.02 * p.pose.rotation).requires_grad_()
+    first = lambda x: PnPNet(None)(*p[:3], init=Pose(x, p.pose.translation)).init.rotation  # noqa: E731
+    assert torch.autograd.gradcheck(first, matrix)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, torch.nan])
+def test_a_given_matrix_that_is_no_rotation_is_ignored(factor, make_problems):
+    p = make_problems()
+    given = Pose(factor * p.pose.rotation, p.pose.translation)
+    result = create_solver("epnp-lm")(*p[:3], init=given)
+    assert_same(result.pose, create_solver("epnp-lm")(*p[:3]).pose, 1e-6, 1e-6)
+    assert (create_solver("identity-lm", m=0)(*p[:3], init=given).status == Status.INIT).all()
 
 
 def test_integers_are_numbers(make_problems):
@@ -253,7 +358,10 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
         (lambda: create_solver("pnpnet-nine"), r"pnpnet-nine.*identity-lm"),
         (lambda: create_solver(["epnp"]), "epnp"),
         (lambda: create_solver(None), "None"),
-        (lambda: create_solver("identity-lm", iterations=3), "iterations"),
+        (lambda: create_solver("identity-lm", iterations=3), r"options: got .* 'iterations'\.$"),
+        (lambda: create_solver("p3p-ransac", iterations=3), r"options: got .* 'iterations'\.$"),
+        (lambda: create_solver("pnpnet-n9", iterations=3), r"options: got .* 'iterations'\.$"),
+        (lambda: create_solver("poselib", iterations=3), r"options: got .* 'iterations'\.$"),
         (lambda: create_solver("pnpnet-n9", m=-1), "m must"),
         (lambda: create_solver("epnp-lm", effort="adaptive"), "effort"),
         (lambda: PnPNet.from_config({**saved_net().config(), "init": {"name": "MLPInit", "n": "six"}}), "six"),
@@ -271,3 +379,24 @@ def test_solvers_that_there_are_not_raise_an_error_that_names_what_is_wrong(make
 def test_solvers_have_sorted_names_and_are_in_evaluation_mode():
     assert list_solvers() == sorted(list_solvers())
     assert not create_solver("identity-lm", m=3).training
+
+
+class _Solved(Dataset):
+    """Solves one problem per item, without ``torch.no_grad``."""
+
+    def __init__(self, name):
+        self.solver, self.problems = create_solver(name), SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, i):
+        return self.solver(*(x[i] for x in self.problems[:3]))
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "identity-lm"])
+def test_a_data_loader_returns_results_and_loaded_weights_can_be_trained(name):
+    result = next(iter(DataLoader(_Solved(name), batch_size=4, num_workers=1)))
+    assert result.rotation.shape == (4, 3, 3)
+    if name in shipped_weights():
+        assert all(x.requires_grad for x in PnPNet.from_pretrained(name).parameters())

@@ -4,6 +4,8 @@ import csv
 import json
 import logging
 import runpy
+import shlex
+import signal
 import subprocess
 import sys
 from copy import deepcopy
@@ -17,6 +19,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from kornia_pnpnet import PnPNet
+from kornia_pnpnet.training.checkpoint import History
 from kornia_pnpnet.training.results import load_run
 
 REPO = Path(__file__).resolve().parents[1]
@@ -64,7 +67,7 @@ def train(monkeypatch):
 
 @pytest.mark.parametrize("data", DATA)
 def test_every_data_config_trains(data, fit_config):
-    model = ["model=set"] if data in ("matches", "wide") else []  # batches of different sizes
+    model = ["model=set"] if data in ("depth_maps", "matches", "wide") else []  # batches of different sizes
     config = composed(f"data={data}", "debug=two_updates", *model)
     assert fit_config(config).update == 2
 
@@ -184,12 +187,16 @@ def test_compilation_changes_neither_the_numbers_nor_what_is_saved(tmp_path):
     assert "compile=" not in (tmp_path / "true" / "weights" / "README.md").read_text()
 
 
-def test_sweep_leaves_results_and_a_summary(tmp_path, train):
+def test_sweep_leaves_results_and_a_summary(tmp_path, train, capsys):
     train("-m", "model.n=6,9", "model.m=0,2", "data.outliers.max_ratio=0.33", f"hydra.sweep.dir={tmp_path}")
     assert len(list(tmp_path.glob("*/results.json"))) == 4
     with (tmp_path / "summary.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {(row["model.n"], row["model.m"]) for row in rows} == {("6", "0"), ("6", "2"), ("9", "0"), ("9", "2")}
+    table = capsys.readouterr().out
+    for value in ("model.n", "model.m", "uniform", *(row["us_per_problem"] for row in rows)):
+        assert f" {value} |" in table
+    assert "max_ratio" not in table.partition("| model.n")[2]  # the same in all runs
     for row in rows:
         results = json.loads((tmp_path / row["run"] / "results.json").read_text())
         assert float(row["uniform/rate"]) == pytest.approx(
@@ -211,6 +218,34 @@ def test_sweeps_by_other_launchers(launcher, tmp_path):
     ends = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
     run(*command, f"hydra.sweep.dir={tmp_path}")
     assert ends == {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
+
+
+def test_an_interrupted_sweep_names_the_command_that_continues_it(tmp_path, train, monkeypatch):
+    """The folder of a sweep contains the time, and has to be passed."""
+    write, command = History.write, ["-m", "model.n=6,9", f"hydra.sweep.dir={tmp_path}/a b", "train.updates=3"]
+
+    def interrupt(self, row):
+        write(self, row)
+        if row["update"] == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(History, "write", interrupt)
+    with pytest.raises(SystemExit) as stopped:
+        train(*command)
+    monkeypatch.setattr(History, "write", write)
+    assert stopped.value.code == 130
+    (log,) = tmp_path.glob("a b/*/train.log")
+    python, script, *words = shlex.split(log.read_text().partition("Continue with: ")[2])
+    assert (python, script, words[: len(command)]) == ("python", str(REPO / "train.py"), command)
+    train(*(word for word in words if word not in SMALL))
+    assert len(list(tmp_path.glob("a b/*/results.json"))) == 2
+
+
+def test_a_missing_gpu_is_named(tmp_path, train):
+    if torch.cuda.is_available() or torch.backends.mps.is_available():
+        pytest.skip("has a GPU")
+    with pytest.raises(SystemExit, match=r"accelerator=gpu .* sees 0 CUDA devices"):
+        train("engine=gpu", f"hydra.run.dir={tmp_path}")
 
 
 # --- experiments ------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import csv
 import math
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -75,8 +76,9 @@ def stopping_loss(at, number):
     """Sends a signal to this process and its workers during one update, as a terminal does."""
 
     def stop():
-        for pid in (os.getpid(), *(child.pid for child in multiprocessing.active_children())):
-            os.kill(pid, number)
+        for child in multiprocessing.active_children():
+            os.kill(child.pid, number)
+        signal.raise_signal(number)
         return 1.0
 
     return LossWith(stop, at=(at,))
@@ -93,6 +95,8 @@ def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, 
 
     stopped = make_parts()
     handler = signal.getsignal(number)
+    if workers and sys.platform == "win32":
+        pytest.skip("os.kill ends the workers")
     stopped["loss"] = stopping_loss(3, number)
     report = fit(folder=tmp_path / "parts", data_workers=workers, **stopped)
     assert not multiprocessing.active_children()
@@ -159,9 +163,33 @@ def test_a_checkpoint_is_continued_by_the_same_run_only(tmp_path):
         other = PnPNet(MLPInit(6), RobustWeightedLM(2), **{option: value})
         with pytest.raises(TrainingError, match=rf"of another run: model\.{option} was .* and is {value!r}\.$"):
             fit(folder=tmp_path, identity=identity, resume=True, **{**make_parts(), "model": other})
+    with pytest.raises(TrainingError, match=r"of another run: settings\.updates was 6 and is 5\.$"):
+        fit(folder=tmp_path, identity=identity, resume=True, **make_parts(updates=5))
     assert (tmp_path / CHECKPOINT_NAME).read_bytes() == content
     report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
     assert (report.start, report.update) == (6, 6)
+
+
+def test_a_run_becomes_longer_with_the_schedule_of_the_longer_run(tmp_path):
+    """The run may have ended, and may be continued again."""
+    fit(folder=tmp_path, **make_parts())
+    report = fit(folder=tmp_path, resume=True, **{**make_parts(updates=12), "loss": stopping_loss(3, signal.SIGTERM)})
+    assert (report.start, report.update, report.interrupted) == (6, 9, True)
+    assert fit(folder=tmp_path, resume=True, **make_parts(updates=12)).update == 12
+    rows, lengths = read_history(tmp_path), [6] * 6 + [12] * 6
+    assert [row["update"] for row in rows] == [str(update) for update in range(1, 13)]
+    for update, (row, length) in enumerate(zip(rows, lengths, strict=True)):
+        settings = make_parts(updates=length)["settings"]
+        assert float(row["lr"]) == pytest.approx(settings.lr * settings.lr_factor(update), rel=1e-5)
+        assert float(row["ramp"]) == pytest.approx(settings.ramp_factor(update), rel=1e-5)
+
+
+def test_each_phase_of_a_run_has_a_progress_bar(tmp_path, capsys):
+    """Updates of the network alone are faster, and say nothing about the time of later updates."""
+    fit(folder=tmp_path, **{**make_parts(ramp=(0.5, 0.6)), "progress": True})
+    bars = capsys.readouterr().err
+    assert re.search(r"network alone: 100%\|.+\| 3/3", bars)
+    assert re.search(r"with refinement: 100%\|.+\| 6/6", bars)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])
@@ -236,6 +264,7 @@ def make_double():
 
 
 # A second process that is forked imports nothing anew.
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
 @pytest.mark.parametrize("strategy", ["ddp_fork", pytest.param("ddp", marks=pytest.mark.slow)])
 def test_two_processes_equal_one(strategy, tmp_path):
     """Two CPU processes with gloo share the batch of one and arrive at the same weights."""

@@ -296,7 +296,7 @@ def run(
         poses[name] = [solve_by_colmap(x, matches) for x, matches in zip(photos, pairs, strict=True)]
         lap(name)
 
-    weights = [w for result in results for w in result.weights]
+    inliers = [mask for result in results for mask in result.inliers]
     rows, drawn = [], []
     for i, photo in enumerate(photos):
         error = errors_px(kept[i], photo)
@@ -305,7 +305,7 @@ def run(
         row["outliers_of_all"] = (errors_px(matched[i], photo) > INLIER_PX).double().mean().item()
         row |= {name: error_of(found[i], photo.pose, metre) for name, found in poses.items()}
         rows.append(row)
-        drawn.append((kept[i], weights[i][: len(error)] > 0.5, row))
+        drawn.append((kept[i], inliers[i][: len(error)], row))
     ms = {stage: 1000.0 * x / len(photos) for stage, x in seconds.items()}
     stages = {stage: ms[stage] for stage in ("features", "retrieval", "matching", "confidence")}
     solvers = {name: summary([row[name] for row in rows], ms[name]) for name in poses}

@@ -84,20 +84,30 @@ def incremental_map(results: dict[str, Any]) -> str:
 
 
 def pose_network(results: dict[str, Any]) -> str:
-    """Errors of the networks of each loss."""
+    """Errors on test images during the trainings."""
+    columns = {"ok": "{:.0%}", "rotation_deg": "{:.1f}°", "translation": "{:.2f}", "pixels": "{:.1f} px"}
     lines = []
-    for name, rows in results["runs"].items():
-        turns = ", ".join(f"{row['rotation_deg']:.1f}°" for row in rows)
-        shifts = ", ".join(f"{row['translation']:.2f}" for row in rows)
-        lines.append([name, turns, shifts])
-    seeds = len(next(iter(results["runs"].values())))
-    caption = f"Median errors on test poses after {results['steps']} steps from nothing, {seeds} seeds"
-    return f"{caption}:\n\n{markdown_table(['Loss', 'rotation', 'translation'], lines)}"
+    for rows in zip(*results["curves"], strict=True):
+        cells = [", ".join(form.format(row[name]).replace("%", " %") for row in rows) for name, form in columns.items()]
+        lines.append([str(rows[0]["step"]), *cells])
+    table = markdown_table(["Step", "`ok`", "rotation", "translation", "keypoints"], lines)
+    return f"Share of poses that are `ok` and median errors, on test images:\n\n{table}"
+
+
+def serve(results: dict[str, Any]) -> str:
+    """Latencies and throughput, by the number of clients and of PyTorch's threads."""
+    lines = []
+    for row in results["rows"]:
+        name = "`Server`" if row["solve"] == "Server" else "each client calls the solver"
+        times = [f"{row[level]:.0f}" for level in ("p50", "p90", "p99", "per_second")]
+        lines.append([f"{row['clients']}", f"{row['threads']}", name, *times])
+    header = ["Clients", "PyTorch threads", "", "median (ms)", "90 %", "99 %", "problems per second"]
+    return f"{results['requests']} problems of 50 pairs, `pnpnet-set`:\n\n{markdown_table(header, lines)}"
 
 
 #: The tables of each page.
 PAGES = {
-    "README.md": (localiser, tracking, keypoint_covariances, fiducial_board),
+    "README.md": (localiser, tracking, keypoint_covariances, fiducial_board, serve),
     "clients.md": (incremental_map, pose_network),
 }
 

@@ -1,7 +1,8 @@
 """The figures of the paper's protocol, from results files: ``python docs/results/figures.py a.json --out figures``.
 
-Files are those of ``pnpnet evaluate`` and of operation counts (``complexity.json``). Each figure for which the files
-hold data is drawn. Each function writes the picture ``path``, whose ending gives the format, and returns the path.
+Files are those of ``pnpnet evaluate``, of operation counts (``complexity.json``) and of sweeps (``summary.csv``). Each
+figure for which the files hold data is drawn. Each function writes the picture ``path``, whose ending gives the format,
+and returns the path.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from contextlib import suppress
 from fractions import Fraction
-from itertools import pairwise
+from itertools import cycle, pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,6 +31,7 @@ from kornia_pnpnet.evaluation import load_results
 from kornia_pnpnet.evaluation.plots import COLOURS, WIDTH, log_scale, make_figure, save, themed
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
 from kornia_pnpnet.metrics import success_rate
+from kornia_pnpnet.training.card import HOW_IT_RAN
 
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
 
@@ -54,6 +56,7 @@ _LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters
 _ROW = 0.165  # inches from one solver to the next: a line of letters
 _MOST_TICKS = 6  # largest number of places on a horizontal axis that are all ticked
 _LABELS = {"rate": "solved (%)", "us": "µs per problem", "n": "pairs n", "m": "iterations m"}
+_LABELS |= {f"model.{name}": _LABELS[name] for name in "nm"}
 Styles = Mapping[str, Mapping[str, Any]]  # arguments of Axes.plot by name
 Panel = tuple[str, pd.DataFrame, str]
 
@@ -172,10 +175,11 @@ def draw_curves(
         if y in first:
             axes.sharey(first[y])
         first.setdefault(y, axes)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if log else MaxNLocator(_MOST_TICKS, integer=True))
+        whole = all(float(place).is_integer() for place in places)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if log else MaxNLocator(_MOST_TICKS, integer=whole))
         if len(places) <= _MOST_TICKS:
             axes.set_xticks(places)
-        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.xaxis.set_major_formatter("{x:,.0f}" if whole else "{x:g}")
         axes.set_xticks([], minor=True)
     for y, axes in first.items():
         if y == "rate":
@@ -401,8 +405,8 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
     return made
 
 
-_MIXES = ((GREEN, "o", "-"), (BLUE, "s", "--"), (VERMILION, "^", "-."), (PINK, "D", ":"))
-_TIME = "time, least over the mixes"
+_SWEEP_LOOKS = ((GREEN, "o", "-"), (BLUE, "s", "--"), (VERMILION, "^", "-."), (PINK, "D", ":"))
+_TIME = "least time of the lines"
 
 
 def mix_in_words(max_ratio: float) -> str:
@@ -412,29 +416,52 @@ def mix_in_words(max_ratio: float) -> str:
     return f"0 to ⌊{most}/{share.denominator}⌋ outliers" if share else "no outliers"
 
 
-def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: Literal["n", "m"]) -> Path:
-    """Draw the success of trained networks against n or m: a panel for each value of the other, a line for each mix.
+def plot_sweep(path: str | Path, summary_csv: str | Path, *, against: str, data: str = "uniform") -> Path:
+    """Draw the success of the runs of a sweep on a validation set, and their time, against an override.
 
-    The panels below show the time, which does not depend on the mix. ``summary_csv`` is the summary of ``train.py -m
-    experiment=sweep``; ``ValueError`` when two rows have the same n, m and mix.
+    The first other override that differs between runs has a panel for each value. All further overrides have a line for
+    each combination of values. The panels below show the least time over the lines. ``summary_csv`` is the summary of
+    ``train.py -m``. ``ValueError`` when ``against`` has not several numbers, when two runs have the same overrides, or
+    without the validation set.
     """
-    named = {"model.n": "n", "model.m": "m", "data.outliers.max_ratio": "mix", "us_per_problem": "us"}
-    named |= {f"uniform/{name}": name for name in ("rate", "low", "high")}
-    runs = pd.read_csv(summary_csv, usecols=list(named)).rename(columns=named)
-    runs = runs.assign(solver=runs.mix.map(mix_in_words))
-    runs[["rate", "low", "high"]] *= 100
-    if runs.duplicated(["n", "m", "mix"]).any():
-        raise ValueError(f"'{summary_csv}' has several runs with the same n, m and mix of outliers.")
-    mixes = {mix_in_words(mix): _MIXES[index % len(_MIXES)] for index, mix in enumerate(sorted(runs.mix.unique()))}
-    styles = {name: line_style(*look) for name, look in {**mixes, _TIME: (GREY, "X", "-")}.items()}
-    times = runs.groupby(["n", "m"], as_index=False).us.min().assign(solver=_TIME)
-    other = "m" if against == "n" else "n"
-    values = sorted(runs[other].unique())
-    panels = [(f"{other} = {value}", runs[runs[other] == value], "rate") for value in values]
-    panels += [("", times[times[other] == value], "us") for value in values]
-    heading = [f"Success and time of short trainings against {against}, with 95 % intervals"]
-    heading.append("Each network is tested on the mix of outliers that it was trained on.")
-    return draw_curves(path, heading, panels, against, styles)
+    runs, varied, numbers = read_sweep(summary_csv)
+    sets = [name.removesuffix("/rate") for name in runs.columns if name.endswith("/rate")]
+    for name, known in ((against, numbers), (data, sets)):
+        if name not in known:
+            raise ValueError(f"'{summary_csv}' has {', '.join(known) or 'nothing'} to draw, and not '{name}'.")
+    if runs.duplicated(varied).any():
+        raise ValueError(f"'{summary_csv}' has several runs with the same overrides.")
+    panel, *others = [name for name in varied if name != against] or [""]
+    rates = {name: 100 * runs[f"{data}/{name}"] for name in ("rate", "low", "high")}
+    runs = runs.assign(**rates, us=runs.us_per_problem, **{"": ""}).sort_values(varied)
+    runs["solver"] = [", ".join(map(in_sweep_words, others, row)) or data for row in runs[others].to_numpy()]
+    looks = dict(zip(runs.sort_values(others or [""]).solver.unique(), cycle(_SWEEP_LOOKS), strict=False))
+    styles = {name: line_style(*look) for name, look in {**looks, _TIME: (GREY, "X", "-")}.items()}
+    parts = [(in_sweep_words(panel, value), part) for value, part in runs.groupby(panel, dropna=False)]
+    panels = [(title, part, "rate") for title, part in parts]
+    panels += [("", part.groupby(against, as_index=False).us.min().assign(solver=_TIME), "us") for _, part in parts]
+    title = f"Success on '{data}' and time of trained networks against {short_name(against)}, with 95 % intervals"
+    return draw_curves(path, [title], panels, against, styles)
+
+
+def read_sweep(summary_csv: str | Path) -> tuple[pd.DataFrame, list[str], list[str]]:
+    """The runs of a sweep, the overrides that differ between them, and those overrides that are numbers."""
+    runs = pd.read_csv(summary_csv)
+    overrides = [name for name in runs.columns[: runs.columns.get_loc("update")] if name not in ("run", *HOW_IT_RAN)]
+    varied = [name for name in overrides if runs[name].nunique(dropna=False) > 1]
+    return runs, varied, list(runs[varied].dropna(axis=1).select_dtypes("number"))
+
+
+def in_sweep_words(name: str, value: Any) -> str:
+    """An override of a sweep, in words."""
+    if name == "data.outliers.max_ratio":
+        return mix_in_words(float(value))
+    return f"{short_name(name)} = {value}" if name else ""
+
+
+def short_name(override: str) -> str:
+    """The last part of an override's name."""
+    return override.rpartition(".")[2]
 
 
 @themed
@@ -510,15 +537,23 @@ def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mappi
 def main(argv: Sequence[str] | None = None) -> None:
     """Draw the figures of results files and print their paths."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", metavar="RESULTS.json", nargs="+", type=Path)
+    parser.add_argument("files", metavar="FILE", nargs="+", type=Path, help="results (JSON) or a sweep's summary.csv")
     parser.add_argument("--out", metavar="FOLDER", default="outputs/figures", help="default: outputs/figures")
     arguments = parser.parse_args(argv)
     results = []
     for path in arguments.files:
+        if path.suffix == ".csv":
+            numbers = read_sweep(path)[2]
+            if not numbers:
+                parser.error(f"{path}: no override differs between runs and is a number in all of them.")
+            for name in numbers:
+                print(plot_sweep(Path(arguments.out) / f"sweep_against_{short_name(name)}.png", path, against=name))
+            continue
         content = json.loads(path.read_text(encoding="utf-8"))
         counts = isinstance(content, dict) and content.get("kind") == "complexity"
         results.append(content if counts else load_results(path))
-    print(*paper_figures(results, arguments.out), sep="\n")
+    if results:
+        print(*paper_figures(results, arguments.out), sep="\n")
 
 
 if __name__ == "__main__":

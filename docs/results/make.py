@@ -36,7 +36,7 @@ def main() -> None:
         "--only",
         nargs="+",
         default=(),
-        choices=(*RESULTS, "honesty", "probability", "complexity"),
+        choices=(*RESULTS, "honesty", "probability", "judge", "complexity"),
         help="for measure: these files",
     )
     scenes = HERE.parents[2] / "shared" / "data"

@@ -338,7 +338,7 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    wanted = set(only or (*RESULTS, "honesty", "probability", "complexity"))
+    wanted = set(only or (*RESULTS, "honesty", "probability", "judge", "complexity"))
     for names, step in STEPS:
         if wanted & names:
             step(Counts(scenes, synthetic_count, real_count), wanted & names)
@@ -346,6 +346,10 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
         from measure_probability import measure_probability  # needs hydra
 
         write_json(HERE / "probability.json", measure_probability(SEED_TUNE, SEED_REPORT + 60))
+    if "judge" in wanted:
+        from measure_judge import measure_judge
+
+        write_json(HERE / "judge.json", measure_judge(scenes, SEED_REPORT + 70))
     if "complexity" in wanted:
         write_json(HERE / "complexity.json", complexity_results())
 

@@ -116,6 +116,22 @@ def belief(found: Mapping[str, Any]) -> str:
     return markdown_table(["`ok` of far-off / of right poses (%)", *(f"`{name}`" for name in names)], lines)
 
 
+def judge(found: Mapping[str, Any]) -> str:
+    """What each part of the judge is worth: a row for each part, a column for each set."""
+    sets = found["sets"]
+    whole = {name: rows[""] for name, rows in sets.items()}
+
+    def cell(name: str, part: str) -> str:
+        row, before = sets[name][part], whole[name]
+        change, error = (100 * x for x in (row["success"] - before["success"], row["error"]))
+        return f"{change:+.1f} ± {error:.1f}; {100 * row['far_ok']:.1f}"
+
+    first = [f"{100 * row['success']:.1f}; {100 * row['far_ok']:.1f}" for row in whole.values()]
+    parts = [part for part in next(iter(sets.values())) if part]
+    lines = [["whole judge", *first], *([f"without {part}", *(cell(name, part) for name in sets)] for part in parts)]
+    return markdown_table(["Solved (%) or change; far off and `ok` (%)", *sets], lines)
+
+
 def page() -> str:
     """The results page as Markdown."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
@@ -144,6 +160,7 @@ def page() -> str:
         ours_beside_peers=compare_all((rates["paper"], rates["gaussian_pose"], rates["real"]), OURS, PEERS),
         honest=honesty(load("honesty")),
         belief=belief(load("probability")),
+        judge=judge(load("judge")),
         chi_square=CHI_SQUARE_95,
         distribution_table=format_table(results["distribution"]),
         ablation=ablation(runs["ablation"]),
@@ -196,8 +213,8 @@ def render() -> None:
     paper_figures([*(load_results(HERE / f"{name}.json") for name in drawn), load("complexity")], HERE)
     for name in shipped_weights():
         plot_training(HERE / f"training-{name}.png", WEIGHTS_FOLDER / name / "history.csv")
-    plot_sweep(HERE / "sweep_against_n.png", HERE / "sweep.csv", against="n")
-    plot_sweep(HERE / "sweep_against_m.png", HERE / "sweep.csv", against="m")
+    plot_sweep(HERE / "sweep_against_n.png", HERE / "sweep.csv", against="model.n")
+    plot_sweep(HERE / "sweep_against_m.png", HERE / "sweep.csv", against="model.m")
     plot_reliability(HERE / "reliability.png", load("honesty")["reliability"])
     plot_real_matches(HERE / "real_matches.png", load_matches()[0], load("real_matches_cost"))
     plot_problem(HERE / "problem.png")

@@ -17,6 +17,9 @@ __all__ = ["ARGUMENTS", "SYNTHETIC", "OneLineParser", "load_solver_without_truth
 
 _T = TypeVar("_T")
 
+# Largest standard deviation of the logarithm of a focal length. With a larger one the focal length is unknown.
+_MOST_SIGMA = 3.0
+
 #: Names of synthetic data for ``--data``.
 SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
 
@@ -63,7 +66,12 @@ def _counts(text: str) -> list[int]:
 
 def _focal(text: str) -> dict[str, Any]:
     """Parse ``--focal`` into options of :class:`~kornia_pnpnet.PnPNet`."""
-    return {"focal": text} if text in ("known", "unknown") else {"focal": "unknown", "focal_sigma": _positive(text)}
+    if text in ("known", "unknown"):
+        return {"focal": text}
+    if (sigma := _positive(text)) > _MOST_SIGMA:
+        fix = f"pass --intrinsics {text},{text},cx,cy; SIGMA is a fraction, such as 0.1"
+        raise argparse.ArgumentTypeError(f"{text} is a focal length: {fix}")
+    return {"focal": "unknown", "focal_sigma": sigma}
 
 
 def _path(text: str) -> str:
@@ -93,8 +101,7 @@ and optionally weights (N,) and intrinsics (3, 3)"""
 _CAMERA = """a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example
 SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; errors are those of undistorted pixels"""
 _FOCAL = "estimate the focal length; SIGMA: that of the intrinsics is right up to this fraction, such as 0.1"
-_THRESHOLD = """reject correspondences with a larger reprojection error; default: a robust estimate of three standard
-deviations, at least 3 px"""
+_THRESHOLD = "reject correspondences with a larger reprojection error; default: reject all but the solver's inliers"
 _SOLVERS = """names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or folders
 of weights; solvers for another n are skipped; default: all installed solvers for these n, and the bounds"""
 _DATA = f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic"
@@ -112,6 +119,10 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "--solver": _SOLVER,
         "--plot": _arg("draw pixels, reprojections and rejected correspondences", "PNG", type=_picture),
         "--threshold": _arg(_THRESHOLD, "PX", type=_positive),
+        "--diagnose": _flag(
+            "try the usual mistakes (swapped columns, y up, another image size) and name the right one"
+        ),
+        "--json": _flag("print JSON on a terminal, too"),
         "--batch": _flag("FILE are shards of many problems, or folders of shards"),
         "--out": _arg("where --batch writes poses; default: outputs/poses", "FOLDER"),
         "--batch-size": _arg("problems per call", "B", type=_whole(1), default=10_000),

@@ -22,14 +22,10 @@ __all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays",
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 _ZIP_MAGIC = b"PK\x03\x04"
-# Ratio of the standard deviation of a normal distribution to its median absolute deviation.
-_MAD_TO_SIGMA = 1.4826
-# Smallest automatic rejection limit in pixels: three standard deviations of a corner detector's noise.
-_MIN_LIMIT_PX = 3.0
 
 
 class ImageCorrespondences(NamedTuple):
-    r"""The correspondences of one image, in float64.
+    r"""The correspondences of one image, in float64, or in float32 if all arrays of the file are float32.
 
     Attributes:
         world_points: shape :math:`(N, 3)`.
@@ -76,10 +72,9 @@ def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
         raise InputError(source, "the intrinsics are not finite")
     if matrix[1, 0] != 0 or matrix[2, :2].any() or matrix[2, 2] == 0:
         raise InputError(source, "the intrinsics must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] or a multiple of it")
-    matrix = matrix / matrix[2, 2]
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-        raise InputError(source, f"the focal lengths must be positive, got {matrix[0, 0]:g} and {matrix[1, 1]:g}")
-    return matrix
+    if matrix[0, 0] == 0 or matrix[1, 1] == 0:
+        raise InputError(source, f"the focal lengths must not be 0, got {matrix[0, 0]:g} and {matrix[1, 1]:g}")
+    return matrix / matrix[2, 2]
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
@@ -119,7 +114,11 @@ def _read_csv(path: Path) -> ImageCorrespondences:
 
 def _read_npz(path: Path) -> ImageCorrespondences:
     arrays = read_arrays(path, ImageCorrespondences._fields)
+    if arrays["world_points"].ndim == 3:
+        raise InputError(path, f"world_points of {arrays['world_points'].shape} are many problems: pass --batch")
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
+    # A file of float32 is solved in float32, so that the solver knows the precision of the points.
+    dtype = np.float32 if np.result_type(np.float32, *arrays.values()) == np.float32 else np.float64
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
     tensors = {}
     for name, array in arrays.items():
@@ -130,7 +129,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
         if bad.any():
             wanted = "finite and at least 0" if name == "weights" else "finite"
             raise InputError(path, f"{name}[{int(np.nonzero(bad)[0][0])}] must be {wanted}")
-        tensors[name] = torch.tensor(array.astype(np.float64))
+        tensors[name] = torch.tensor(array.astype(dtype))
     if "intrinsics" in tensors:
         tensors["intrinsics"] = _pinhole(tensors["intrinsics"], path)
     return ImageCorrespondences(**tensors)
@@ -148,23 +147,15 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def reproject(
-    world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose, limit_px: float | None = None
-) -> tuple[Tensor, Tensor, float]:
+def reproject(world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose) -> tuple[Tensor, Tensor]:
     """Compute the reprojection errors of one image. ``pose`` is a batch of one pose.
 
     Returns:
-        Three values in pixels: the reprojections (N, 2), the reprojection errors (N,), and the largest accepted error.
-        Reprojections and errors are NaN for points that are not in front of the camera. If ``limit_px`` is ``None``,
-        the largest accepted error is 3 times 1.4826 times the median error, but at least 3 px.
+        The reprojections (N, 2) and the reprojection errors (N,) in pixels; NaN for points that are not in front of the
+        camera.
     """
     cam_points = transform_points(pose.matrix, world_points[None])[0]
     in_front = cam_points[:, 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
     pixels = torch.where(in_front, pixels, torch.nan)
-    errors = (pixels - img_points).norm(dim=-1)
-    if limit_px is None:
-        finite = errors[errors.isfinite()].double()
-        sigma = _MAD_TO_SIGMA * finite.quantile(0.5).item() if len(finite) else 0.0
-        limit_px = max(_MIN_LIMIT_PX, 3.0 * sigma)
-    return pixels, errors, limit_px
+    return pixels, (pixels - img_points).norm(dim=-1)

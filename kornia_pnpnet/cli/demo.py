@@ -83,19 +83,21 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
     index = int(outliers.argmax())
     world_points, img_points, intrinsics = (x[index] for x in entry.problems[:3])
     with torch.no_grad():
-        pose = solver(world_points[None], img_points[None], intrinsics[None]).pose
-    pixels, errors, limit = reproject(world_points, img_points, intrinsics, pose)
-    return plot_pose(path, img_points, pixels, ~(errors <= limit), f"{name}, {int(outliers[index])} outliers")
+        result = solver(world_points[None], img_points[None], intrinsics[None])
+    pixels, _ = reproject(world_points, img_points, intrinsics, result.pose)
+    return plot_pose(path, img_points, pixels, ~result.inliers[0], f"{name}, {int(outliers[index])} outliers")
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
     """Train briefly and print the success rates of the first and last validation; ``None`` if a package is missing."""
+    from kornia_pnpnet.core.extras import needs
     from kornia_pnpnet.core.files import read_csv
 
     try:
-        from kornia_pnpnet.training.loop import train_briefly
+        with needs("train", "no training"):
+            from kornia_pnpnet.training.loop import train_briefly
     except ImportError as error:
-        print(f"pnpnet: no training: {error}; pip install 'kornia_pnpnet[train]'", file=sys.stderr)
+        print(f"pnpnet: {error}", file=sys.stderr)
         return None
     print(f"\nTraining a new network for about {seconds:.0f} s:", flush=True)
     history = train_briefly(seconds, folder)

@@ -22,9 +22,18 @@ def run(arguments: argparse.Namespace) -> int:
     target = Path(arguments.file)
     if target.suffix not in (".onnx", ".pt2"):
         raise ValueError(f"'{target}': the file's name must end in .onnx (ONNX) or .pt2 (compiled ahead of time)")
-    from kornia_pnpnet.export import INPUTS, OUTPUTS, RIG_INPUTS, ExportedCamera, export_onnx, export_package
+    from kornia_pnpnet.export import (
+        INPUTS,
+        OUTPUTS,
+        RIG_INPUTS,
+        ExportedCamera,
+        check_packages,
+        export_onnx,
+        export_package,
+    )
     from kornia_pnpnet.solver import PnPNet
 
+    check_packages(target.suffix)
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")

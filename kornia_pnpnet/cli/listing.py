@@ -31,12 +31,13 @@ _WHAT = {
 def run(_: argparse.Namespace) -> int:
     """Print the description of each solver, and the package that must be installed, if any."""
     from kornia_pnpnet import list_solvers, shipped_weights
+    from kornia_pnpnet.core.extras import how_to_install
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package
 
     states = {}
     for name in list_solvers():
         package = missing_package(name)
-        missing = f" (needs {package}: pip install 'kornia_pnpnet[eval]')" if package else ""
+        missing = f" (needs {package}: {how_to_install('eval')})" if package else ""
         states[name] = _WHAT[max(filter(name.startswith, _WHAT), key=len)] + missing
     states |= dict.fromkeys(BOUNDS, "bound: needs the true pose, for `pnpnet evaluate` only")
     for name, state in states.items():

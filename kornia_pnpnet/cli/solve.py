@@ -1,6 +1,7 @@
 """Find the pose of one image, or of many problems in files.
 
-The pose of one image is printed as JSON: x_cam = R x_world + t.
+The pose of one image, x_cam = R x_world + t, is printed as a table on a terminal, and as JSON into a pipe or with
+--json. Standard deviations are those that the noise of the inliers implies; rotations are about the camera's axes.
 
   pnpnet solve matches.csv --intrinsics 3400,3400,3024,2016 --plot pose.png
 
@@ -24,7 +25,7 @@ import argparse
 import json
 import math
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kornia_pnpnet.cli.arguments import load_solver_without_truth
 
@@ -35,11 +36,17 @@ _ADVICE = {
     "too_few_pairs": "a pose needs at least three correspondences that a camera can see",
     "degenerate": "the points lie on a line or coincide",
     "not_finite": "the file has NaN, infinity or a negative weight",
-    "camera": "the intrinsics are not those of a pinhole camera that this solver takes",
-    "not_believed": "too few correspondences agree with the pose; with many outliers try "
-    "--solver p3p-ransac:threshold=PX, and check units, intrinsics and the order of the columns",
+    "camera": "the intrinsics are not those of a pinhole camera that this solver takes, or do not fit the pixels",
+    "not_believed": "the correspondences are too few or too similar to determine the pose",
+    "precision": "the points have large coordinates and small differences: store them as float64, or subtract an "
+    "offset before they become float32",
     "behind": "the points are behind the camera; check the axes: x to the right, y down, z forward",
 }
+# Largest noise and smallest share of inliers that are plausible. Correspondences of a wrong convention exceed them.
+_MOST_NOISE_PX, _LEAST_SHARE = 10.0, 0.5
+_MISTAKES = (
+    "swapped columns, another image size, y up? try --diagnose; many outliers? try --solver p3p-ransac:threshold=PX"
+)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -48,8 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.camera and (arguments.intrinsics or arguments.focal or arguments.batch):
         raise ValueError("--camera stands alone: without --intrinsics, --focal and --batch")
-    if arguments.batch and (arguments.plot or arguments.threshold):
-        raise ValueError("--plot and --threshold are for one image, not for --batch")
+    if arguments.batch and (arguments.plot or arguments.threshold or arguments.json or arguments.diagnose):
+        raise ValueError("--plot, --threshold, --json and --diagnose are for one image, not for --batch")
     if not arguments.batch and (len(arguments.file) > 1 or arguments.out):
         raise ValueError("several files and --out need --batch")
     camera = camera_matrix(arguments.intrinsics) if arguments.intrinsics else None
@@ -89,7 +96,7 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
 def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     import torch
 
-    from kornia_pnpnet import Status
+    from kornia_pnpnet import Status, diagnose
     from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences, reproject
 
     (path,), name, plot = arguments.file, arguments.solver, arguments.plot
@@ -102,34 +109,92 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         raise InputError(path, "the file has no intrinsics: pass --intrinsics fx,fy,cx,cy")
     if plot and plot.exists() and not arguments.overwrite:
         raise ValueError(f"'{plot}' exists: pass --overwrite to replace it")
-    solver, weights = _load_solver(arguments), None if weights is None else weights[None]
+    solver, pairs, camera = _load_solver(arguments), (world_points[None], img_points[None]), camera.to(img_points)
+    focal = getattr(solver, "focal", "known")
+    if arguments.diagnose and focal == "unknown":
+        raise ValueError("--diagnose needs a known focal length")
+    used = torch.ones(len(world_points)).bool() if weights is None else weights > 0
+    diagnosis = str(diagnose(world_points[used], img_points[used], camera)) if arguments.diagnose else None
     with torch.no_grad():
-        result = solver(world_points[None], img_points[None], camera[None], weights)
+        result = solver(*pairs, camera[None], None if weights is None else weights[None])
+        uncertain = {"focal": focal, "focal_sigma": getattr(solver, "focal_sigma", None)}
+        covariance = result.covariance(*pairs, result.intrinsics, **uncertain)
     camera, ok, status = result.intrinsics[0], bool(result.ok), Status(int(result.status)).name.lower()
-    pixels, errors, limit = reproject(world_points, img_points, camera, result.pose, arguments.threshold)
-    rejected = ~(errors <= limit) | ~result.ok  # without a pose all correspondences are rejected
-    pairs = zip(result.weights[0].tolist(), errors.tolist(), rejected.tolist(), strict=True)
+    pixels, errors = reproject(world_points, img_points, camera, result.pose)
+    limit = arguments.threshold
+    rejected = ~(result.inliers[0] if limit is None else errors <= limit) | ~result.ok  # without a pose all pairs
+    deviations = torch.where(result.ok, covariance[0].diagonal().sqrt(), torch.nan)
     answer = {
         "solver": name,
         "n": len(world_points),
         "ok": ok,
         "status": status,
+        "inliers": int(result.inliers.sum()),
+        "sigma_px": result.sigma.item(),
+        "probability": result.probability.item(),
         "rotation": result.rotation[0].tolist(),
+        "rotation_sigma_deg": _finite(deviations[:3].rad2deg()),
         "translation": result.translation[0].tolist(),
+        "translation_sigma": _finite(deviations[3:6]),
         "quaternion_wxyz": result.pose.quaternion[0].tolist(),
         "intrinsics": camera.tolist(),
+        **({"focal_sigma_px": _finite(deviations[6:] * camera[0, 0])[0]} if focal == "unknown" else {}),
+        **({"diagnosis": diagnosis} if diagnosis else {}),
         "cost": result.cost.item(),
         "rejected_above_px": limit,
         "pairs": [
-            {"weight": weight, "reprojection_error_px": error if math.isfinite(error) else None, "rejected": bad}
-            for weight, error, bad in pairs
+            {"weight": weight, "reprojection_error_px": error, "rejected": bad}
+            for weight, error, bad in zip(result.weights[0].tolist(), _finite(errors), rejected.tolist(), strict=True)
         ],
     }
-    print(json.dumps(answer, indent=2, allow_nan=False))
+    if arguments.json or not sys.stdout.isatty():
+        print(json.dumps(answer, indent=2, allow_nan=False))
+    else:
+        print(_table(answer, result.pose.rvec[0].rad2deg().tolist()))
     if plot:
         from kornia_pnpnet.evaluation.plots import plot_pose
 
         plot_pose(plot, img_points, pixels, rejected, name if ok else f"{name}: NOT SOLVED")
-    if not ok:
-        print(f"pnpnet: not solved ({status}): {_ADVICE[status]}", file=sys.stderr)
+    doubts = _doubts(answer, int(used.sum())) if status in ("solved", "not_believed") else []
+    reason = f"{' and '.join(doubts)}: {_MISTAKES}" if doubts else _ADVICE.get(status)
+    if reason:
+        print(f"pnpnet: {reason}" if ok else f"pnpnet: not solved ({status}): {reason}", file=sys.stderr)
     return 0 if ok else 1
+
+
+def _finite(values: Tensor) -> list[float | None]:
+    """A list for JSON, with ``None`` in place of numbers that are not finite."""
+    return [value if math.isfinite(value) else None for value in values.tolist()]
+
+
+def _doubts(answer: dict[str, Any], count: int) -> list[str]:
+    """The tests of plausibility that an answer fails; ``count`` correspondences have a weight."""
+    inliers, sigma = answer["inliers"], answer["sigma_px"]
+    few = [f"only {inliers} of {count} correspondences agree with the pose"] if inliers < _LEAST_SHARE * count else []
+    noisy = sigma > _MOST_NOISE_PX
+    return few + ([f"the inliers show {sigma:.3g} px of noise, more than {_MOST_NOISE_PX:g}"] if noisy else [])
+
+
+def _table(answer: dict[str, Any], rvec_deg: list[float]) -> str:
+    """The answer in a few lines for a terminal."""
+
+    def row(values: list[float], sigmas: list[float | None], unit: str = "") -> str:
+        spread = [sigma for sigma in sigmas if sigma is not None]
+        least = min(filter(None, spread), default=1e-3)  # two digits of the smallest standard deviation are shown
+        digits = min(max(1 - math.floor(math.log10(least)), 0), 9)
+        text = [f"{value:.{digits}f}" for value in values] + ["±"] * bool(spread) + [f"{sigma:.2g}" for sigma in spread]
+        return " ".join([*text, unit]).rstrip()
+
+    rows = {
+        "status": answer["status"],
+        "inliers": f"{answer['inliers']} of {answer['n']}",
+        "sigma": f"{answer['sigma_px']:.3g} px",
+        "probability": f"{answer['probability']:.3f}",
+        "rotation": row(rvec_deg, answer["rotation_sigma_deg"], "degrees, axis times angle"),
+        "translation": row(answer["translation"], answer["translation_sigma"]),
+    }
+    if "focal_sigma_px" in answer:
+        rows["focal length"] = row([answer["intrinsics"][0][0]], [answer["focal_sigma_px"]], "px")
+    if "diagnosis" in answer:
+        rows["diagnosis"] = answer["diagnosis"]
+    return "\n".join(f"{name:<13} {text}" for name, text in rows.items())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import platform
 import subprocess
+import sys
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 
-__all__ = ["environment"]
+__all__ = ["environment", "peak_resident_bytes"]
 
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
 # Distributions of OpenCV on PyPI, the most common distribution first.
@@ -38,6 +39,16 @@ def environment() -> dict[str, Any]:
         "commit": _commit(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
+
+
+def peak_resident_bytes() -> int:
+    """Return the peak resident memory of this process; 0 on Windows, where Python has no module ``resource``."""
+    if sys.platform == "win32":
+        return 0
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def _version(package: str) -> str | None:

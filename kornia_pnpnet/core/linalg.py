@@ -291,21 +291,21 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
     return rotation, target_mean - torch.bmm(rotation, source_mean[..., None])[..., 0], scale
 
 
-def span_a_plane(centred: Tensor, share: Tensor, size: Tensor) -> Tensor:
-    """Tell whether points span more than a line, bool (B,).
+def span_a_plane(centred: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    """Tell whether points span more than a line, bool (B,), first as given and second beyond the rounding of the dtype.
 
     Args:
-        centred: the points minus their mean, 0 for padding, (3, N, B).
+        centred: the points minus their mean, 0 for padding, (3, N, B). Before centring, the largest absolute coordinate
+            was 1.
         share: the inverse of the number of points, (B,).
-        size: the largest absolute coordinate of the points before centring, (B,). With a size of 0 or NaN the result is
-            false.
     """
     # The sum of the principal 2×2 minors of the covariance is (trace² - sum of squared entries) / 2. This sum divided
     # by the trace approximates the second largest eigenvalue, which is only a rounding error for points on a line.
     eps = torch.finfo(centred.dtype).eps
-    covariance = (centred[:, None] * centred).sum(2) * (share / (size * size))  # (3, 3, B), in units of the size
-    trace = covariance.diagonal().sum(-1)
-    return ((1.0 - 16.0 * eps) * trace - 2.0 * (64.0 * eps) ** 2) * trace > covariance.square().sum((0, 1))
+    covariance = (centred[:, None] * centred).sum(2) * share  # (3, 3, B)
+    trace, squares = covariance.diagonal().sum(-1), covariance.square().sum((0, 1))
+    along = (1.0 - 16.0 * eps) * trace
+    return along * trace > squares, (along - 2.0 * (64.0 * eps) ** 2) * trace > squares
 
 
 def solve_leading(
@@ -401,12 +401,13 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
                 [0.5000]]), tensor([True]))
     """
     limits = torch.finfo(right.dtype)
+    least = limits.tiny**0.5  # the gradient of an inverse pivot has its square
     eye = torch.eye(len(right), dtype=right.dtype, device=right.device)
     damped = torch.addcmul(matrix, matrix, eye[..., None] * damping)
     if not are_few(right):
         rows = [[*row[: i + 1]] for i, row in enumerate(damped.unbind())]
         diagonal = [row[-1] for row in rows]
-        smallest, infinite = torch.full_like(diagonal[0], limits.tiny), torch.full_like(diagonal[0], torch.inf)
+        smallest, infinite = torch.full_like(diagonal[0], least), torch.full_like(diagonal[0], torch.inf)
         good: list[Tensor] = []
 
         def inverse(k: int, pivot: Tensor) -> Tensor:
@@ -419,7 +420,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
     batched = damped.permute(2, 0, 1)
     factor, info = torch.linalg.cholesky_ex(batched.detach())
     pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
-    solved = (pivots > limits.tiny).all(1) & (info == 0)  # NaN compares false
+    solved = (pivots > least).all(1) & (info == 0)  # NaN compares false
     # Gradients of a failed factorisation are NaN. If gradients are needed, the matrices are factorised again, with the
     # identity in place of each matrix whose factorisation failed.
     if batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:

@@ -83,9 +83,9 @@ class Symmetric3(NamedTuple):
         """The symmetric parts of matrices (..., 3, 3)."""
         return cls(*_upper(matrix))
 
-    def scaled(self, factor: Tensor) -> Symmetric3:
-        """Scale the matrix, and add a multiple of the identity that exceeds the rounding error of the entries."""
-        xx, xy, xz, yy, yz, zz = (factor * x for x in self)
+    def divided(self, length: Tensor) -> Symmetric3:
+        """Divide lengths by a length, and add a multiple of the identity that exceeds the entries' rounding errors."""
+        xx, xy, xz, yy, yz, zz = (x / length / length for x in self)
         more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()
         return Symmetric3(xx + more, xy, xz, yy + more, yz, zz + more)
 
@@ -139,4 +139,4 @@ def equivalent_sigma(matrix: Symmetric2 | Symmetric3) -> Tensor:
     variance = torch.stack([row[-1] for row in _lower_rows(matrix)]).mean(0)
     positive = (variance > 0) & (variance < torch.inf)  # the square root has an infinite gradient at 0
     sigma = torch.where(positive, variance, 1.0).sqrt()
-    return torch.where(positive, sigma, torch.where(variance == 0, 0.0, torch.nan))
+    return torch.where(positive, sigma, torch.nan).masked_fill(variance == 0, 0.0)

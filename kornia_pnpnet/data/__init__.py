@@ -7,6 +7,7 @@ scenes from files. ``stream`` draws batches in worker processes.
 
 from kornia_pnpnet.data.cameras import CameraProblems
 from kornia_pnpnet.data.colmap import load_scene
+from kornia_pnpnet.data.depth_maps import DepthMaps
 from kornia_pnpnet.data.mixtures import MixedPoints, MixedProblems, VaryingSize
 from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix
 from kornia_pnpnet.data.points import (
@@ -24,6 +25,7 @@ from kornia_pnpnet.data.synthetic import SyntheticProblems
 __all__ = [
     "BoxPoints",
     "CameraProblems",
+    "DepthMaps",
     "DrivePoints",
     "FacadePoints",
     "MixedPoints",

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.data.scenes import Scene, View
 
@@ -89,14 +90,12 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         matrix, pixels = _pinhole(lens, img_points.double().numpy())
     except (ValueError, RuntimeError, IndexError, AttributeError, TypeError) as error:
         raise ValueError(f"expected MODEL,width,height,params of COLMAP, got {camera!r}: {_line(error)}") from error
-    return torch.tensor(matrix), torch.tensor(pixels)
+    return torch.tensor(matrix, device="cpu"), torch.tensor(pixels, device="cpu")
 
 
 def _pycolmap() -> Any:
-    try:
+    with needs("eval", "COLMAP's models and cameras need pycolmap"):
         import pycolmap
-    except ImportError as error:
-        raise ImportError("COLMAP's models and cameras need pycolmap: pip install 'kornia_pnpnet[eval]'") from error
     return pycolmap
 
 
@@ -144,8 +143,8 @@ def _colmap_views(folder: Path) -> Iterator[View]:
         # `~(depth <= 0)` keeps NaN depths. View then refuses the pose, which is not finite.
         seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
         arrays = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
-        world, img, camera, rotation, translation = map(torch.tensor, arrays)
-        inliers, size = torch.ones(len(world), dtype=torch.bool), (image.camera.width, image.camera.height)
+        world, img, camera, rotation, translation = (torch.tensor(x, device="cpu") for x in arrays)
+        inliers, size = torch.ones_like(world[:, 0], dtype=torch.bool), (image.camera.width, image.camera.height)
         yield View(image.name, world, img, camera, rotation, translation, *size, inliers)
 
 
@@ -175,4 +174,4 @@ def _numbers(arrays: Mapping[str, np.ndarray], key: str, *shape: int | None) -> 
     if not fits or array.dtype.kind not in "fiu":
         wanted = ", ".join("any" if s is None else str(s) for s in shape)
         raise ValueError(f"'{key}' has shape {array.shape} of {array.dtype}, expected numbers of ({wanted})")
-    return torch.tensor(array.astype(np.float64))
+    return torch.from_numpy(array.astype(np.float64))

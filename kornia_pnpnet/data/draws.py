@@ -39,7 +39,8 @@ class RandomProblems:
 
     def batch(self, index: int) -> Problems:
         """Draw a batch; the first index is 0."""
-        problems = self._draw(batch_generator(self.seed, index))
+        with torch.device("cpu"):  # not PyTorch's default device: the generator is on the CPU
+            problems = self._draw(batch_generator(self.seed, index))
         return problems.map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
 
     def _draw(self, generator: torch.Generator) -> Problems:

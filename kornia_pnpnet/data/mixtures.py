@@ -66,7 +66,7 @@ class MixedProblems:
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
         # The order interleaves the sources, so that every slice of a batch has approximately the same shares.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
-        self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__))
+        self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__), device="cpu")
 
     def batch(self, index: int) -> Problems:
         """Draw a batch; the first index is 0."""
@@ -177,5 +177,5 @@ class VaryingSize:
     def batch(self, index: int) -> Problems:
         """Draw a batch; the first index is 0."""
         generator = batch_generator(self.seed + _SIZES, index)
-        turn = int(torch.randint(len(self.sources), (), generator=generator))
+        turn = int(torch.randint(len(self.sources), (), generator=generator, device="cpu"))
         return self.sources[turn].batch(index)

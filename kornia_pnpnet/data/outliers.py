@@ -118,7 +118,7 @@ class OutlierMix:
         KORNIA_CHECK(most <= n, f"{most} outliers do not fit into n = {n} pairs.")
 
         def chance(*shape: int) -> Tensor:
-            return torch.rand(batch_size, *shape, generator=generator)
+            return torch.rand(batch_size, *shape, generator=generator, dtype=torch.float32)
 
         count = torch.randint(least, most + 1, (batch_size, 1), generator=generator)
         rank = chance(n).argsort(-1).argsort(-1)
@@ -128,7 +128,7 @@ class OutlierMix:
             chosen = chance(1) < self.structured_share
             low, high = self.structured_ratio
             ratio = uniform((batch_size, 1), low, high, generator) if low < high else low
-            chosen = is_open & chosen & (rank < ((n - count) * ratio + _SLACK).floor())
+            chosen = is_open & chosen & (rank < ((n - count).double() * ratio + _SLACK).floor())
             kind[chosen], is_open = OutlierKind.STRUCTURED, is_open & ~chosen
         if self.near_share:
             chosen = is_open & (chance(n) < self.near_share)

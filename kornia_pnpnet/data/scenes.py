@@ -58,7 +58,8 @@ class View:
                 raise ValueError(f"image '{self.name}': {name} has shape {tuple(value.shape)}, expected {shape}")
             if not value.isfinite().all():
                 raise ValueError(f"image '{self.name}': {name} has values that are not finite")
-        deviation = (self.rotation @ self.rotation.mT - torch.eye(3, dtype=self.rotation.dtype)).abs().max()
+        eye = torch.eye(3, dtype=self.rotation.dtype, device=self.rotation.device)
+        deviation = (self.rotation @ self.rotation.mT - eye).abs().max()
         if deviation > 1e-3 or self.rotation.det() < 0:
             raise ValueError(f"image '{self.name}': rotation is not a rotation matrix")
 
@@ -137,8 +138,8 @@ class SceneProblems(RandomProblems):
         pairs = zip(*((view.cam_points, view.img_points, view.inliers) for view in views), strict=True)
         self._pairs = [torch.cat(parts) for parts in pairs]
         self._intrinsics = torch.stack([view.intrinsics for view in views])
-        self._size = torch.tensor([[view.width, view.height] for view in views], dtype=torch.float64)
-        self._counts = torch.tensor([len(view.world_points) for view in views])
+        self._size = torch.tensor([[view.width, view.height] for view in views], dtype=torch.float64, device="cpu")
+        self._counts = torch.tensor([len(view.world_points) for view in views], device="cpu")
 
     @property
     def max_translation(self) -> float:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges
+from kornia_pnpnet.data.depth_maps import DepthMaps
 from kornia_pnpnet.data.draws import RandomProblems, log_uniform, normal, random_poses, uniform, unit
 from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, PointPrior
@@ -44,6 +45,10 @@ _LEAST_COSINE = 0.05
 # Largest half side of an image at a focal length of 1, if `half_image` is `None`. Without this limit, points beside the
 # camera would make the image huge.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
+# The first pairs of a problem are no copies. A choice: eight originals can still hold a pose.
+_LEAST_ORIGINALS = 8
+# Fields of `Problems` with one value for each pair. Sigmas of whole problems have one dimension, and no copies.
+_OF_PAIRS = ("world_points", "img_points", "inliers", "img_sigma", "world_sigma", "confidence", "img_cov", "world_cov")
 # Largest blur in `_bunched`, relative to the mean distance. A choice: at a blur of 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
 # Choices for confidences. `_SEPARATION`: distance between the mean scores of inliers without noise and of outliers.
@@ -92,6 +97,10 @@ class SyntheticProblems(RandomProblems):
             confidences. The separation of inliers from outliers and the scale of the logits differ between problems.
         bunched_share: share of the problems with a bunch. In these problems, inliers, *near* and *structured* outliers
             lie in a part of the image. The points of other outliers come from the rest of the scene.
+        depth_maps: errors of world points that depth cameras have measured, in addition to ``world_sigma``. Known noise
+            does not include them. ``None`` means no such errors.
+        copies_share: share of the problems with copies, as from detectors that list a place several times. In these
+            problems, up to half of the pairs are copies of other pairs. The first 8 pairs are no copies.
         dtype: dtype of the batches; numbers are drawn in float64.
         device: device of the batches; numbers are drawn on the CPU.
 
@@ -118,13 +127,17 @@ class SyntheticProblems(RandomProblems):
     known_noise: float = 0.0
     confidence_share: float = 0.0
     bunched_share: float = 0.0
+    depth_maps: DepthMaps | None = None
+    copies_share: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         sizes = {name: getattr(self, name) for name in ("max_angle", "half_image", "translation_sigma")}
         check_numbers(0.0, **{name: value for name, value in sizes.items() if value is not None})
         check_positive(focal=self.focal)
-        shares = {name: getattr(self, name) for name in ("known_noise", "confidence_share", "bunched_share")}
+        shares = {
+            name: getattr(self, name) for name in ("known_noise", "confidence_share", "bunched_share", "copies_share")
+        }
         check_numbers(0.0, 1.0, **shares)
         check_numbers(1.0, _MOST_RATIO, axis_ratio=self.axis_ratio)
         for name, (low, high) in _AMOUNTS.items():
@@ -155,6 +168,10 @@ class SyntheticProblems(RandomProblems):
         world_points = (cam_points - pose.translation[:, None]) @ pose.rotation
         noise, world_sigma, world_cov = self._noise(world_points.shape, self.world_sigma, 0.0, generator)
         world_points += noise
+        is_flying = torch.zeros_like(has_other)
+        if self.depth_maps is not None:
+            moves, is_flying = self.depth_maps(cam_points, generator)
+            world_points += moves @ pose.rotation
         shown = torch.where(has_other, other_points, cam_points)
         if mix.structured_share:
             moved = structured_points(cam_points, mix, generator)
@@ -167,7 +184,7 @@ class SyntheticProblems(RandomProblems):
         noise, img_sigma, img_cov = self._noise(img_points.shape, self.img_sigma, self.degrees, generator)
         img_points += noise
         length = noise.norm(dim=-1)
-        inliers = ((kind == OutlierKind.INLIER) & in_front)[..., 0]
+        inliers = ((kind == OutlierKind.INLIER) & in_front & ~is_flying)[..., 0]
         if self.degrees:
             inliers &= length <= _MOST_NOISE * img_sigma
         if mix.near_share:
@@ -188,7 +205,19 @@ class SyntheticProblems(RandomProblems):
             errors = length / img_sigma.mean(1, keepdim=True).clamp(min=_TINY)
             known["confidence"] = self._confidence(inliers, errors, generator)
         intrinsics = torch.tensor((self.focal, self.focal, 1.0), dtype=torch.float64).diag()
-        return Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers, **known)
+        problems = Problems(world_points, img_points, intrinsics.expand(size, 3, 3), pose, inliers, **known)
+        return self._with_copies(problems, generator) if self.copies_share else problems
+
+    def _with_copies(self, problems: Problems, generator: torch.Generator) -> Problems:
+        """Replace pairs by copies of other pairs; see ``copies_share``."""
+        size, n = problems.inliers.shape
+        share = torch.where(unit((size, 1), generator) < self.copies_share, unit((size, 1), generator) / 2.0, 0.0)
+        is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
+        other = (n * unit((size, n), generator)).long().clamp(max=n - 1)
+        index = torch.where(is_copy, other, torch.arange(n))
+        of_pairs = {name: x for name, x in problems._asdict().items() if name in _OF_PAIRS and x is not None}
+        taken = {name: x[torch.arange(size)[:, None], index] for name, x in of_pairs.items() if x.ndim > 1}
+        return problems._replace(**taken)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
         """Draw uniform pixels of the image, (B, N, 2)."""

@@ -15,17 +15,16 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.evaluation.results import row_errors
 
-try:
+with needs("eval", "Pictures need matplotlib"):
     from matplotlib import rc_context
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
     from matplotlib.ticker import Formatter, LogLocator, NullFormatter
-except ImportError as error:
-    raise ImportError("Pictures need matplotlib: pip install 'kornia_pnpnet[eval]'") from error
 
 __all__ = ["plot_errors", "plot_pose", "plot_success", "plot_training"]
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.files import atomic_open, digest
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import PoseErrors, SuccessRate
@@ -61,11 +62,9 @@ def load_results(path: str | Path) -> dict[str, Any]:
         ImportError: when pydantic is not installed.
         ValueError: when the file is not a results file of this format. The message names the first invalid entry.
     """
-    try:
+    with needs("eval", "reading results files needs pydantic"):
         from kornia_pnpnet.core.schema import read_json
         from kornia_pnpnet.evaluation.forms import Evaluation
-    except ImportError as error:
-        raise ImportError("reading results files needs pydantic: pip install 'kornia_pnpnet[eval]'") from error
     results: dict[str, Any] = read_json(path, Evaluation, "a results file of evaluation")
     return results
 

@@ -11,17 +11,25 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import solve_symmetric
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.evidence import Evidence
+from kornia_pnpnet.judge.evidence import AtPose, Evidence
 from kornia_pnpnet.problem import MIN_PAIRS, Problem
-from kornia_pnpnet.refine.information import information
 from kornia_pnpnet.refine.residual import Projection, normal_equations
 
-__all__ = ["LAW", "LEAST_PROBABILITY", "Belief", "believe", "clipped", "has_enough", "pose_sigma", "probability"]
+__all__ = [
+    "FAR_TURN",
+    "LAW",
+    "LEAST_PROBABILITY",
+    "Belief",
+    "believe",
+    "clipped",
+    "has_enough",
+    "pose_sigma",
+    "probability",
+]
 
 #: A pose is believed when its :func:`probability` is at least this value.
 LEAST_PROBABILITY = 0.9
@@ -29,8 +37,8 @@ LEAST_PROBABILITY = 0.9
 #: logarithm of ``sigma``. ``python docs/results/make.py measure --only probability`` fitted the law.
 LAW = (-1.573, 0.6221, -0.4594)
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
-# Largest errors of a correct pose: of the rotation in radians, and of the translation as a share of the distance.
-_FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
+#: Largest errors of a correct pose: of the rotation in radians, and of the translation as a share of the distance.
+FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
 # Largest `pose_sigma` of a pose that is believed. Two standard deviations are the largest error of a correct pose.
 _OPEN = 0.5
 # Largest standard deviation of plausible noise in radians, or 13 pixels at a focal length of 800 pixels. With 0.0125,
@@ -59,7 +67,7 @@ class Belief(NamedTuple):
 
 
 @torch.no_grad()
-def believe(projection: Projection, problem: Problem, found: Evidence, known: Tensor) -> Belief:
+def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> Belief:
     """Tell whether a pose is to be believed.
 
     The :func:`probability` must be at least `LEAST_PROBABILITY`, and :func:`pose_sigma` must be small. The points of
@@ -67,16 +75,14 @@ def believe(projection: Projection, problem: Problem, found: Evidence, known: Te
     pixels, show much noise at their best pose.
 
     Args:
-        projection: the points projected at the pose.
+        seen: the residuals at the pose.
         problem: the problem.
         found: the evidence for the pose.
         known: whether the caller gave the noise of a problem, bool (B, 1).
     """
-    projection, problem = map_tensors(torch.Tensor.detach, (projection, problem))
-    _, precision = information(projection, problem)
     scale = found.inlier / found.mixture.variance
-    precision = scale if problem.noise is None else map_tensors(lambda x: scale * x, precision)
-    sigma = pose_sigma(projection, problem, precision)
+    precision = map_tensors(lambda x: scale * x, seen.precision)
+    sigma = pose_sigma(seen.projection, problem, precision).detach()
     plausible = (found.sigma < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
     usable = plausible & (sigma < _OPEN) & _leave_a_line(problem.world_points, found.inlier > 0.5)
     chances = torch.where(usable, probability(found.log_ratio, sigma).to(problem.weights), 0.0)
@@ -140,10 +146,11 @@ def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Sym
     total = share.sum(-1).clamp(min=torch.finfo(torch.float32).tiny)
     sq_distance = ((share * distance).sum(-1) / total).square()
     for own, other, mixed, unit in (
-        (turn, shift, cross, _FAR_TURN**2),
+        (turn, shift, cross, FAR_TURN**2),
         (shift, turn, cross.mT, _FAR_SHIFT**2 * sq_distance),
     ):
-        left = own - mixed.mT @ solve_symmetric(other, mixed)  # the other block is eliminated (Schur complement)
+        # The other block is eliminated (Schur complement).
+        left = torch.baddbmm(own, mixed.mT, solve_symmetric(other, mixed), alpha=-1)
         eye = torch.eye(3, dtype=left.dtype, device=left.device)
         part = solve_symmetric(left, eye.expand_as(left)).diagonal(dim1=1, dim2=2).sum(-1)
         variance = variance + torch.where(part > 0, part, torch.inf) / unit  # NaN becomes infinite, too
@@ -166,18 +173,20 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
     A line does not determine a pose. Outliers can fit a pose by chance, because a line leaves one rotation free. With
     eight or more inliers, three points must therefore lie off the line.
     """
-    weights = inliers.to(world_points.dtype)
+    weights = there = inliers.to(world_points.dtype)
+    tiny = torch.finfo(weights.dtype).tiny
     for _ in range(_LINE_ROUNDS):
-        share = (weights / weights.sum(-1, keepdim=True).clamp(min=1e-6))[..., None]
-        centred = world_points - (share * world_points).sum(1, keepdim=True)
-        matrix = centred.mT @ (share * centred)
-        matrix = matrix / matrix.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp(min=1e-30)
+        share = (weights / weights.sum(-1, keepdim=True).clamp(min=tiny))[:, None]
+        centred = world_points - torch.bmm(share, world_points)
+        matrix = torch.bmm(centred.mT, share.mT * centred)
+        matrix = matrix / matrix.norm(dim=(1, 2), keepdim=True).clamp(min=tiny)
         for _ in range(_SQUARINGS):  # the direction of the line is the first eigenvector
-            matrix = matrix @ matrix
-        direction = functional.normalize(matrix.sum(-1, keepdim=True), dim=1)
-        along = centred @ direction
-        sq_off = (centred - along * direction.mT).square().sum(-1)
-        sq_size = (share * along.square()).sum((1, 2))[:, None]
-        weights = inliers / (1.0 + sq_off / (_OFF**2 * sq_size).clamp(min=1e-30))
-    off = (inliers & (sq_off > _OFF**2 * sq_size)).sum(-1)
+            matrix = torch.bmm(matrix, matrix)
+        direction = matrix.sum(-1, keepdim=True)
+        direction = direction / direction.norm(dim=1, keepdim=True).clamp(min=tiny)
+        along = torch.bmm(centred, direction)
+        sq_off = (centred - torch.bmm(along, direction.mT)).square().sum(-1)
+        limit = _OFF**2 * torch.bmm(share, along.square())[:, 0]
+        weights = there / (1.0 + sq_off / limit.clamp(min=tiny))
+    off = (inliers & (sq_off > limit)).sum(-1)
     return off >= (inliers.sum(-1) - _FEW).clamp(1, MIN_PAIRS)

@@ -28,12 +28,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.symmetric import Symmetric2
-from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem
+from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, State
 from kornia_pnpnet.refine.information import information
-from kornia_pnpnet.refine.residual import Projection
+from kornia_pnpnet.refine.residual import Projection, project
 
-__all__ = ["Evidence", "Mixture", "at_pose", "copies", "evidence", "outlier_area", "updated", "votes"]
+__all__ = ["AtPose", "Evidence", "Mixture", "at_pose", "copies", "evidence", "outlier_area", "updated", "votes"]
 
 # Unknown noise: the smallest standard deviation of the grid in radians, the ratio of neighbouring variances, and the
 # number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
@@ -58,6 +57,27 @@ _POSES = 4
 _KEY = 1.0, 0.7548776662, 0.5698402910, 0.3247179572, 0.2451223338
 
 
+class AtPose(NamedTuple):
+    """The residuals of a problem at a pose, for :func:`evidence`.
+
+    Attributes:
+        projection: the points projected at the pose.
+        sq_residual: squared residuals in variances of their pixel, infinite behind the camera, (B, N).
+        density: the square root of the determinant of the precision, (B, N).
+        precision: inverse variance of each pixel, (B, N), or inverse covariance.
+    """
+
+    projection: Projection
+    sq_residual: Tensor
+    density: Tensor
+    precision: Tensor | Symmetric2
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns of the state."""
+        return 6 + self.projection.state.camera.shape[1]
+
+
 class Mixture(NamedTuple):
     """The distribution of the residuals of a problem.
 
@@ -75,15 +95,16 @@ class Mixture(NamedTuple):
 
     def densities(self, sq_residual: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Relative densities of narrow inliers, wide inliers and outliers, (B, N); see :func:`at_pose`."""
-        narrow = (1.0 - _TAIL) * torch.exp(sq_residual * (-0.5 / self.variance))
-        wide = _TAIL / _WIDE * torch.exp(sq_residual * (-0.5 / _WIDE / self.variance))
-        outlier = 2.0 * math.pi * self.variance * (1.0 / self.share - 1.0) / (self.area * density)
-        return narrow, wide, outlier
+        scaled = sq_residual / self.variance
+        narrow = (1.0 - _TAIL) * (-0.5 * scaled).exp()
+        wide = _TAIL / _WIDE * (-0.5 / _WIDE * scaled).exp()
+        odds = 2.0 * math.pi * (self.share.reciprocal() - 1.0) * self.variance
+        return narrow, wide, odds / (self.area * density)
 
-    def weights(self, sq_residual: Tensor, density: Tensor) -> Tensor:
+    def weights(self, seen: AtPose) -> Tensor:
         """Robust weights (B, N): the derivatives of the negative log-likelihood, at most 1."""
-        narrow, wide, outlier = self.densities(sq_residual, density)
-        return (narrow + wide / _WIDE) / (narrow + wide + outlier)
+        narrow, wide, outlier = self.densities(seen.sq_residual, seen.density)
+        return torch.add(narrow, wide, alpha=1.0 / _WIDE) / (narrow + wide + outlier)
 
 
 class Evidence(NamedTuple):
@@ -142,21 +163,20 @@ def outlier_area(problem: Problem) -> Tensor:
 
 
 @torch.no_grad()
-def evidence(projection: Projection, problem: Problem, votes: Tensor, known: Tensor) -> Evidence:
+def evidence(seen: AtPose, problem: Problem, votes: Tensor, known: Tensor) -> Evidence:
     """Compute the evidence for a pose.
 
     Args:
-        projection: the points of the problem projected at the pose.
+        seen: the residuals at the pose.
         problem: the problem. Its noise is known for every pair or ``None``.
         votes: the result of :func:`votes`.
         known: whether the caller gave the noise of a problem, bool (B, 1).
     """
-    projection, problem = map_tensors(torch.Tensor.detach, (projection, problem))
-    sq_residual, density, _ = at_pose(projection, problem)
-    area, total = outlier_area(problem), votes.sum(-1, keepdim=True).clamp(min=1.0)
+    sq_residual, density, focal = (x.detach() for x in (seen.sq_residual, seen.density, problem.focal))
+    area, total = outlier_area(problem).detach(), votes.sum(-1, keepdim=True).clamp(min=1.0)
     there = votes > 0
     mean = torch.where(there, density.log(), 0.0).sum(-1, keepdim=True) / there.sum(-1, keepdim=True).clamp(min=1)
-    radian = problem.focal.square() * mean.exp()
+    radian = focal.square() * mean.exp()
     factors, log_prior = _grid(radian, known)  # (F, B, 1) each
     half = torch.full_like(factors, 0.5)
     narrow, wide, outlier = Mixture(factors, half, factors, area).densities(sq_residual, density)
@@ -174,54 +194,48 @@ def evidence(projection: Projection, problem: Problem, votes: Tensor, known: Ten
     best = likelihood.argmax(0)[None]
     variance, share = (x.gather(0, best)[0] for x in (factors, share))
     # The smallest angle of the grid stands for all smaller angles.
-    least = torch.where(best[0] > 0, _STEP**-0.5, torch.finfo(share.dtype).eps ** 2) * variance
+    exact = torch.finfo(share.dtype).eps ** 2
+    least = torch.where(best[0] > 0, share.new_full((), _STEP**-0.5), exact) * variance
     mixture = Mixture(variance, share, least, area)
-    unknowns = 6 + projection.state.camera.shape[1]
     for _ in range(_FINAL_ROUNDS):
-        mixture = updated(mixture, sq_residual, density, votes, known, unknowns)
+        mixture = updated(mixture, seen, votes, known)
     narrow, wide, outlier = mixture.densities(sq_residual, density)
     inlier = (narrow + wide) / (narrow + wide + outlier) * there
-    sq_finite = torch.where(sq_residual < torch.inf, sq_residual, 0.0)
-    freedom = (2.0 * (votes * inlier).sum(-1) - unknowns).clamp(min=1.0)
+    sq_finite = sq_residual.nan_to_num(posinf=0.0)
+    freedom = (2.0 * (votes * inlier).sum(-1) - seen.unknowns).clamp(min=1.0)
     sigma = ((votes * inlier * sq_finite).sum(-1) / freedom / radian[:, 0]).sqrt()
     return Evidence(log_ratio, likelihood[..., 0].mT, mixture, inlier, radian, sigma)
 
 
-def at_pose(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor, Tensor | Symmetric2]:
-    """Squared residuals in variances of their pixel, inverse variances, and the precision of the pixels.
-
-    The residual of a point behind the camera is infinite. Without noise, the variance of every pixel is 1 px². The
-    inverse variance is the square root of the determinant of the precision.
-    """
+def at_pose(state: State, problem: Problem) -> AtPose:
+    """Project the points at a pose, and standardise the residuals. Without noise, the variance of a pixel is 1 px²."""
+    projection = project(state, problem)
     sq_residual, precision = information(projection, problem)
     sq_residual = torch.where(projection.in_front, sq_residual, torch.inf)
     if problem.noise is None:
         precision = torch.ones_like(sq_residual)
     density = precision if isinstance(precision, Tensor) else precision.determinant.sqrt()
-    return sq_residual, density, precision
+    return AtPose(projection, sq_residual, density, precision)
 
 
 @torch.no_grad()
-def updated(
-    mixture: Mixture, sq_residual: Tensor, density: Tensor, votes: Tensor, known: Tensor, unknowns: int
-) -> Mixture:
+def updated(mixture: Mixture, seen: AtPose, votes: Tensor, known: Tensor) -> Mixture:
     """One round of expectation and maximisation.
 
     Args:
         mixture: the mixture before the round.
-        sq_residual: see :func:`at_pose`.
-        density: see :func:`at_pose`.
+        seen: the residuals.
         votes: votes of the pairs, (B, N).
         known: where true, the variance does not change, bool (B, 1).
-        unknowns: number of unknowns that were fitted to the pairs.
     """
-    sq_residual, density = sq_residual.detach(), density.detach()
+    sq_residual, density = seen.sq_residual.detach(), seen.density.detach()
     narrow, wide, outlier = mixture.densities(sq_residual, density)
-    votes, total = votes / (narrow + wide + outlier), votes.sum(-1, keepdim=True).clamp(min=1.0)
-    inliers = (votes * (narrow + wide)).sum(-1, keepdim=True)
-    finite = torch.where(sq_residual < torch.inf, sq_residual, 0.0)
-    weighted = (votes * (narrow + wide / _WIDE) * finite).sum(-1, keepdim=True)
-    variance = (weighted / (2.0 * inliers - unknowns).clamp(min=1.0)).maximum(mixture.least)
+    inlier, total = narrow + wide, votes.sum(-1, keepdim=True).clamp(min=1.0)
+    chances = votes / (inlier + outlier)
+    inliers = (chances * inlier).sum(-1, keepdim=True)
+    finite = sq_residual.nan_to_num(posinf=0.0)
+    weighted = (chances * torch.add(narrow, wide, alpha=1.0 / _WIDE) * finite).sum(-1, keepdim=True)
+    variance = (weighted / (2.0 * inliers - seen.unknowns).clamp(min=1.0)).maximum(mixture.least)
     return mixture._replace(
         variance=torch.where(known, mixture.variance, variance),
         share=(inliers / total).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE),

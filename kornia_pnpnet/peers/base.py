@@ -6,7 +6,7 @@ import importlib
 import math
 from dataclasses import dataclass, fields
 from types import ModuleType
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.cameras import pinholes
 from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.problem import MIN_PAIRS
 from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 
@@ -50,7 +51,7 @@ class PeerSolver(nn.Module):
     library gets the pairs that are present and have a weight above 0, but not the weights. A problem without a pose has
     ``ok=False``, and its pose is the identity. A problem is not solved if it
     has fewer than three pairs, a negative weight or a value that is not finite. A problem is also not solved if its
-    camera has skew or a focal length that is not positive.
+    camera has skew or a focal length of 0.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
@@ -76,10 +77,8 @@ class PeerSolver(nn.Module):
         """Import the library, or raise an ``ImportError`` that names the extra to install."""
         assert self.source is not None
         module, name = self.source
-        try:
+        with needs("eval", f"This solver needs {name}"):
             return importlib.import_module(module)
-        except ImportError as error:
-            raise ImportError(f"This solver needs {name}: pip install 'kornia_pnpnet[eval]'") from error
 
     def config(self) -> dict[str, float | int | str | bool]:
         """Return the arguments of the constructor as plain data."""
@@ -131,18 +130,22 @@ class PeerSolver(nn.Module):
             )
         like, largest = inputs.world_points, torch.finfo(inputs.world_points.dtype).max
         world, img, cameras = (x.detach().cpu().double() for x in inputs[:3])
-        present = torch.ones(world.shape[:2], dtype=torch.bool) if inputs.mask is None else inputs.mask.cpu()
+        present = torch.ones_like(world[..., 0], dtype=torch.bool) if inputs.mask is None else inputs.mask.cpu()
         shares = present.double() if inputs.weights is None else inputs.weights.detach().cpu().double()
         used = present & (shares > 0)
         cameras, pinhole = pinholes(cameras)
         pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)  # no peer supports skew
+        # Not every peer supports a negative focal length, so that peers get the reflected image.
+        signs = cameras.diagonal(dim1=1, dim2=2).sign()
+        img, cameras = img * signs[:, None, :2], signs[..., None] * cameras
         sound = world.isfinite().all(-1) & img.isfinite().all(-1) & shares.isfinite() & (shares >= 0) | ~present
         status = torch.where(used.sum(-1) >= MIN_PAIRS, Status.NOT_BELIEVED, Status.TOO_FEW_PAIRS)
         status = torch.where(pinhole, status, Status.CAMERA)
         status = torch.where(sound.all(-1), status, Status.NOT_FINITE)
 
-        poses = torch.eye(3, 4, dtype=torch.float64).repeat(2, len(world), 1, 1)  # final and initial poses
-        inliers, ok = torch.zeros_like(shares), torch.zeros(len(world), dtype=torch.bool)
+        eye = torch.eye(3, 4, dtype=world.dtype, device=world.device)
+        poses = eye.repeat(2, len(world), 1, 1)  # final and initial poses
+        inliers, ok = torch.zeros_like(shares), torch.zeros_like(world[:, 0, 0], dtype=torch.bool)
         for i in (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist():
             found = self.solve_one(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy())
             if found is not None:
@@ -155,7 +158,7 @@ class PeerSolver(nn.Module):
         cost = torch.where(used, truncated, 0.0).sum(-1) / used.sum(-1).clamp(min=1)
 
         kept = inliers > 0
-        freedom = (2.0 * kept.sum(-1) - 6.0).clamp(min=1.0)
+        freedom = (2.0 * kept.sum(-1, dtype=truncated.dtype) - 6.0).clamp(min=1.0)
         sigma = (torch.where(kept, truncated, 0.0).sum(-1) / freedom).sqrt()
 
         def back(values: Tensor) -> Tensor:
@@ -171,12 +174,15 @@ class PeerSolver(nn.Module):
             status=torch.where(ok, Status.SOLVED, status).to(like.device, torch.int8),
             probability=back(ok.double()),
             alternatives=Alternatives.none(pose),
-            intrinsics=back(torch.where(pinhole[:, None, None], cameras, torch.eye(3).double())),
+            intrinsics=back(torch.where(pinhole[:, None, None], signs[..., None] * cameras, eye[:, :3])),
             dist=like.new_zeros(len(like), 4),
             sigma=back(sigma),
             inliers=(inliers > 0).to(like.device),
         )
         return restore_leading(size, result)
+
+    if TYPE_CHECKING:  # nn.Module.__call__ accepts and returns Any
+        __call__ = forward
 
 
 @dataclass(eq=False, repr=False, kw_only=True)

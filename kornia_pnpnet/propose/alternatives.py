@@ -11,10 +11,10 @@ from torch.nn import functional
 from kornia_pnpnet.core.linalg import eigenvectors
 from kornia_pnpnet.core.performance import repeat_problems
 from kornia_pnpnet.core.trees import map_tensors, put, take
-from kornia_pnpnet.judge.belief import LEAST_PROBABILITY
-from kornia_pnpnet.judge.evidence import evidence
+from kornia_pnpnet.judge.belief import FAR_TURN
+from kornia_pnpnet.judge.evidence import Evidence, at_pose, evidence
 from kornia_pnpnet.problem import Problem, Starts, State
-from kornia_pnpnet.propose.p3p import p3p
+from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.scoring import as_entries, as_pose
 from kornia_pnpnet.refine.lm import Plan, Progress, Refinement, RobustWeightedLM, taken
 from kornia_pnpnet.refine.residual import project, rotation_angle
@@ -29,8 +29,7 @@ _LIKELIER = 30.0
 # Two poses are the same minimum if their rotations differ by less than `_SAME_TURN` radians and their positions by less
 # than `_SAME_SHIFT`. A position is the mean point in the camera frame, in units of its distance from the camera.
 _SAME_TURN, _SAME_SHIFT = 0.035, 0.035
-# A mirror image is refined if its median residual is below the first number times the spread of the pixels. With fewer
-# likely inliers than the second number, the mirror image is always refined.
+# A mirror image is refined if most residuals of the inliers are below this number times the spread of the pixels.
 _NEAR_MIRROR = 0.2
 # With a larger share of inliers, a pose has no rivals of other noise.
 _CLEAR = 0.9
@@ -41,9 +40,6 @@ _WIDE_ANGLE, _WIDE_FROM, _GAP = 6.4e-3, 4, 0.4
 _SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.005, 0.97
 # Number of iterations of a rival at this noise, and number of further iterations.
 _FROZEN, _FREE = 3, 5
-# A rival within this angle (radians) of the pose does not lower the pose's
-# :attr:`~kornia_pnpnet.result.PnPResult.probability`.
-_FAR_TURN = math.radians(10.0)
 # Number of iterations by residual from each start, at the noise of the pose.
 _ITERATIONS = 12
 
@@ -73,7 +69,7 @@ def find_alternatives(
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
     plan = refine.begin(problem, starts._replace(pose=pose, others=None, camera=None))
     plan, now = refine.shown(plan, Progress.of(plan.state))
-    inlier = refine.judge(plan, now).evidence.inlier
+    inlier = _shares(refine.judge(plan, now).evidence.inlier)
     middle, mirrored = _mean(problem.world_points, inlier), _mirrored(pose, problem, inlier)
     every = [*map(as_entries, (pose, mirrored)), *_of_three(problem, inlier, pose), *map(as_entries, starts.poses)]
     count, batch = len(every), inlier.shape[0]
@@ -109,8 +105,8 @@ def find_alternatives(
 
 
 def reconsider(
-    refine: RobustWeightedLM, plan: Plan, refined: Refinement, valid: Tensor, rival: Pose | None = None
-) -> Refinement:
+    refine: RobustWeightedLM, plan: Plan, now: Progress, valid: Tensor, rival: Pose | None = None
+) -> tuple[Progress, Evidence, Tensor | None]:
     """Compare refined poses with rivals, and keep the likeliest pose if the refinement has iterations by residual.
 
     One rival starts from the refined pose with a larger noise, if the residuals are almost as likely with this noise.
@@ -121,60 +117,62 @@ def reconsider(
     Args:
         refine: the refinement.
         plan: the plan of the refinement.
-        refined: the result of the refinement.
+        now: the refined states.
         valid: which problems are valid (see :class:`~kornia_pnpnet.frame.Frame`), bool (B,).
         rival: another pose of each problem; ``None``: no such pose.
 
     Returns:
-        The results with their probabilities.
+        For :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for them, and their
+        log-odds against the rivals.
     """
-    found, problem, by_residual = refined.evidence, plan.problem, refine.by_residual > 0
+    problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
+    found = evidence(at_pose(now.state, problem), problem, plan.votes, plan.known)
     with torch.no_grad():
-        mirrored = _mirrored(refined.pose, problem, found.inlier)
-        away = (problem.img_points - _mean(problem.img_points, found.inlier)[:, None]).square().sum(-1)
-        sq_spread = _mean(away[..., None], found.inlier)
-        projection = project(State(mirrored, refined.state.camera), problem)
+        inlier = _shares(found.inlier)
+        mirrored = _mirrored(pose, problem, inlier)
+        away = (problem.img_points - _mean(problem.img_points, inlier)[:, None]).square().sum(-1)
+        sq_spread = (inlier * away).sum(-1, keepdim=True)
+        projection = project(State(mirrored, now.state.camera), problem)
         close = projection.in_front & (projection.sq_residual < _NEAR_MIRROR**2 * sq_spread)
-        mirrors = valid & refined.ok & (_mean(close[..., None], found.inlier)[:, 0] > 0.5)
-        free, share = valid & refined.in_front & ~plan.known[:, 0] & by_residual, found.mixture.share[:, 0]
+        mirrors = valid & (found.log_ratio > 0.0) & ((inlier * close).sum(-1) > 0.5)
+        free, share = valid & ~plan.known[:, 0] & by_residual, found.mixture.share[:, 0]
         gap = found.likelihood - found.grid[:, _WIDE_FROM:].amax(1)
         unclear = free & (share < _CLEAR) & (gap < _GAP * plan.votes.sum(-1))
-        rival = refined.pose if rival is None else rival
-        apart = rotation_angle(rival.rotation, refined.pose.rotation) > _APART
+        rival = pose if rival is None else rival
+        apart = rotation_angle(rival.rotation, pose.rotation) > _APART
         apart &= valid & (share < _CLEAR_OF_RIVALS) & by_residual
         own = found.mixture
         wide = own._replace(variance=own.variance.maximum(_WIDE_ANGLE**2 * found.radian))
-        narrower = torch.where(plan.known, 1.0, 1.0 / _SMALLER)
+        narrower = torch.where(plan.known, own.variance.new_ones(()), 1.0 / _SMALLER)
         narrow = own._replace(variance=narrower * own.variance, least=narrower.square() * own.least)
         chosen = [x.nonzero()[:, 0] for x in (unclear, unclear, mirrors, apart)]
     owners = torch.cat(chosen)
     if not len(owners):
-        return refined
+        return now, found, None
     kind = torch.cat([torch.full_like(rows, i + 1) for i, rows in enumerate(chosen)])
-    poses, mixtures = (refined.pose, refined.pose, mirrored, rival), (own, wide, own, narrow)
+    poses, mixtures = (pose, pose, mirrored, rival), (own, wide, own, narrow)
     starts = [taken((x, y), rows) for x, y, rows in zip(poses, mixtures, chosen, strict=True)]
     pose, mixture = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *starts)
-    every = taken(plan._replace(state=refined.state, starts=1), owners)
-    now = Progress.of(every.state._replace(pose=pose), mixture)
+    every = taken(plan._replace(state=now.state, starts=1), owners)
+    tried = Progress.of(every.state._replace(pose=pose), mixture)
     step, damping, _ = plan.hyperparameters[-1]
     for i in range(_FROZEN + _FREE):
-        now = refine.by_residuals(every, now, every.known | (i < _FROZEN), step, damping)
-    of_ends = evidence(project(now.state, every.problem), every.problem, every.votes, every.known)
+        tried = refine.by_residuals(every, tried, every.known | (i < _FROZEN), step, damping)
+    of_ends = evidence(at_pose(tried.state, every.problem), every.problem, every.votes, every.known)
     # By kind of the rival (0: the refined pose) and by problem, (5, B).
     likelihood = found.likelihood.new_full((len(chosen) + 1, len(valid)), -torch.inf)
     end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()
     likelihood[0] = found.likelihood
     likelihood[kind, owners] = of_ends.likelihood.nan_to_num(-torch.inf)
     end[kind, owners] = torch.arange(len(owners), device=owners.device)
-    if by_residual:
-        best = likelihood.argmax(0)
-        rows = best.nonzero()[:, 0]
+    best = likelihood.argmax(0)
+    rows = best.nonzero()[:, 0]
+    if by_residual and len(rows):
         at = end[best[rows], rows]
-        refined = put(refined, rows, refine.judge(take(every, at), take(now, at), take(of_ends, at)))
-    far = rotation_angle(now.state.pose.rotation, refined.pose.rotation[owners]) > _FAR_TURN
+        now, found = put((now, found), rows, take((tried, of_ends), at))
+    far = rotation_angle(tried.state.pose.rotation, now.state.pose.rotation[owners]) > FAR_TURN
     others[kind, owners] = torch.where(far, likelihood[kind, owners], -torch.inf)
-    probability = refined.probability * (likelihood.amax(0) - others.amax(0)).sigmoid()
-    return refined._replace(probability=probability, ok=refined.ok & (probability >= LEAST_PROBABILITY))
+    return now, found, likelihood.amax(0) - others.amax(0)
 
 
 def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -183,10 +181,14 @@ def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return as_entries(refined.pose), refined.cost, refined.evidence.likelihood, usable
 
 
-def _mean(points: Tensor, weights: Tensor) -> Tensor:
+def _shares(weights: Tensor) -> Tensor:
+    """Weights (B, N) divided by their sum."""
+    return weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
+
+
+def _mean(points: Tensor, shares: Tensor) -> Tensor:
     """Weighted mean (B, C) of points (B, N, C)."""
-    total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
-    return ((weights / total)[..., None] * points).sum(1)
+    return (shares[..., None] * points).sum(1)
 
 
 def _moved(points: Tensor, pose: Pose) -> Tensor:
@@ -194,18 +196,18 @@ def _moved(points: Tensor, pose: Pose) -> Tensor:
     return (pose.rotation @ points[..., None])[..., 0] + pose.translation
 
 
-def _mirrored(pose: Pose, problem: Problem, weights: Tensor) -> Pose:
+def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
     """Apply a half turn about the plane's normal, then the pose, then a half turn about the line of sight."""
-    middle = _mean(problem.world_points, weights)
+    middle = _mean(problem.world_points, shares)
     centred = problem.world_points - middle[:, None]
-    covariance = centred.mT @ (weights[..., None] * centred)
+    covariance = torch.bmm(centred.mT, shares[..., None] * centred)
     if covariance.device.type == "cpu":
         normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
     else:  # cuSOLVER takes 250 KiB for each matrix, and fails for 100,000 matrices
         normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
-    seen = _moved(middle, pose)
-    rotation = _half_turn(seen) @ pose.rotation @ _half_turn(normal)
-    return Pose(rotation, seen - (rotation @ middle[..., None])[..., 0])
+    seen = torch.baddbmm(pose.translation[..., None], pose.rotation, middle[..., None])
+    rotation = torch.bmm(torch.bmm(_half_turn(seen[..., 0]), pose.rotation), _half_turn(normal))
+    return Pose(rotation, torch.baddbmm(seen, rotation, middle[..., None], alpha=-1)[..., 0])
 
 
 def _half_turn(axis: Tensor) -> Tensor:
@@ -221,12 +223,12 @@ def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor
     def farthest(vectors: Tensor) -> Tensor:
         return torch.where(likely > 0, vectors.square().sum(-1), -1.0).argmax(1, keepdim=True)
 
-    first = farthest(points - _mean(points, likely)[:, None])
+    first = farthest(points - _mean(points, _shares(likely))[:, None])
     from_first = points - points[rows, first]
     second = farthest(from_first)
     third = farthest(torch.linalg.cross(from_first, from_first[rows, second].expand_as(points)))
     index = torch.cat((first, second, third), 1)
-    solved = p3p(points[rows, index], problem.img_points[rows, index] / problem.focal)
+    solved = minimal_poses(points[rows, index], problem.img_points[rows, index] / problem.focal)
     entries = torch.where(solved.valid[..., None], as_entries(solved.pose), as_entries(fallback)[:, None])
     return entries.unbind(1)
 

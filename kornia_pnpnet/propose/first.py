@@ -29,9 +29,8 @@ _SEEN = 0.25
 # Inlier threshold for rigs, in focal lengths: 10 px at a focal length of 1000 px.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
-# With a fixed effort, RANSAC solves `_SAMPLES` samples. Each sample is the first of `_DRAWS` draws that P3PRig can
-# solve. If three cameras look in all directions, P3PRig can solve every second draw. Chosen on `CameraProblems` with
-# seed 77002.
+# With a fixed effort, RANSAC solves `_SAMPLES` samples. Each sample is the first of `_DRAWS` draws of three different
+# pairs.
 _SAMPLES, _DRAWS = 128, 4
 # With a fixed effort, this number of pairs scores each pose.
 _JUDGES = 32
@@ -121,22 +120,18 @@ def _of_fixed_effort(problem: Problem) -> Starts:
     img = (_THRESHOLD * problem.focal).expand(there.shape[0], 1)
     thresholds = Thresholds(img, torch.zeros_like(img))
     search = Search(_FINDER, problem, thresholds)
-    search.run_once(_drawn(problem, order, counts), torch.where(turn < counts, judges, -1))
+    search.run_once(_drawn(order, counts), torch.where(turn < counts, judges, -1))
     pose = search.state.pose
     return Starts(pose, judge(project(State.of(pose), problems_last(problem)), problem, thresholds).weights)
 
 
-def _drawn(problem: Problem, order: Tensor, counts: Tensor) -> Tensor:
+def _drawn(order: Tensor, counts: Tensor) -> Tensor:
     """Draw samples (B, S, 3) from the first ``counts`` (B, 1) positions in ``order`` (B, N)."""
     numbers = torch.arange(1, _DRAWS * _SAMPLES + 1, dtype=torch.float64, device=order.device)
     numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)  # (D S, 3)
     ranks = ((numbers - numbers.floor()).flatten() * counts).long()
     drawn = order.gather(1, ranks.minimum((counts - 1).clamp(min=0)))  # (B, D S 3)
-    places = problem.places
-    rays = places.gather(1, drawn[..., None].expand(-1, -1, 3)).unflatten(1, (_DRAWS, _SAMPLES, 3))
     drawn = drawn.unflatten(1, (_DRAWS, _SAMPLES, 3))
-    # P3PRig can solve three different pairs if each ray is less than 90 degrees from the mean ray.
-    ahead = (rays * rays.sum(-2, keepdim=True)).sum(-1).amin(-1) > 0
     apart = (drawn != drawn.roll(1, -1)).all(-1)
-    first = (ahead & apart).long().argmax(1)[:, None, :, None].expand(-1, 1, -1, 3)
+    first = apart.long().argmax(1)[:, None, :, None].expand(-1, 1, -1, 3)
     return drawn.gather(1, first)[:, 0]

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.arguments import Inputs, with_undistorted
-from kornia_pnpnet.cameras import pinholes
+from kornia_pnpnet.cameras import focal_length, pinholes
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
@@ -51,11 +51,11 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
 
     ``sigma`` is the standard deviation of log f. With ``sigma``, the range lies around the caller's focal length.
     Without ``sigma``, the range is proportional to the size of the image. The size is twice the principal point or, if
-    larger, the extent of the pixels. The aspect ratio of the pixels is kept. Matrices that are no pinhole cameras
-    become NaN.
+    larger, the extent of the pixels. The aspect ratio of the pixels and the signs of fx and fy are kept. Matrices that
+    are no pinhole cameras become NaN.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
-    given = (camera[:, 0, 0] * camera[:, 1, 1]).sqrt()  # (B,)
+    given = focal_length(camera)  # (B,)
     if sigma is None:
         with torch.no_grad():
             principal_point = camera[:, None, :2, 2]

@@ -41,7 +41,7 @@ from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose
 
-__all__ = ["P3P", "p3p"]
+__all__ = ["P3P", "minimal_poses", "p3p"]
 
 # Bytes of a vector that has one number per problem of a chunk. A core's caches hold a few dozen of these vectors.
 _CHUNK_BYTES = 2**16
@@ -303,7 +303,7 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
     least = dist.amin(0)
     # No distance exceeds dist[0] + 1, because the longest edge is 1.
     room = torch.addcmul(least, least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER)
-    room.mul_(sound * finfo.eps ** (2 * _ERROR_POWER)).clamp_(max=_LARGEST_ERROR**2)
+    room.mul_(sound).mul_(finfo.eps ** (2 * _ERROR_POWER)).clamp_(max=_LARGEST_ERROR**2)
 
     # R = Σ camera axis · world axisᵀ, t = y1 - R x1.
     axis3, cam3 = _cross(axis1, axis2), _cross(cam1, cam2)
@@ -400,8 +400,18 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     check_shapes({"plane_points": (plane_points, (*size, 3, 2))}, world_points)
     check_devices({"plane_points": plane_points}, world_points)
     dtype = common_dtype({"world_points": world_points, "plane_points": plane_points})
+    world = world_points.detach().to(dtype)
+    largest = world.abs().amax((-2, -1), keepdim=True).clamp(min=torch.finfo(dtype).tiny)
+    unit = largest.log2().floor().exp2()  # a power of two, because rounding could separate double solutions
+    (rotation, translation), valid = minimal_poses(world / unit, plane_points.detach().to(dtype))
+    return Hypotheses(Pose(rotation, torch.where(valid[..., None], translation * unit, 0.0)), valid)
+
+
+def minimal_poses(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
+    """:func:`p3p` for points of one dtype, whose coordinates have fifth powers that neither overflow nor underflow."""
+    size = world_points.shape[:-2]
     solve = _solve if compiling() else _Solve.apply
-    components, valid = solve(*(x.detach().to(dtype).reshape(-1, *x.shape[-2:]) for x in (world_points, plane_points)))
+    components, valid = solve(*(x.detach().reshape(-1, *x.shape[-2:]) for x in (world_points, plane_points)))
     components = components.permute(2, 1, 0).reshape(*size, 4, 12)
     pose = Pose(components[..., :9].unflatten(-1, (3, 3)), components[..., 9:])
     return Hypotheses(pose, valid.mT.reshape(*size, 4))
@@ -430,11 +440,11 @@ class P3P(Configured):
         """Four slots per sample, or per sample and focal length of the grid. See MinimalSolver.hypotheses."""
         plane = problem.img_points / problem.focal
         if problem.free_focal is None:
-            return p3p(problem.world_points, plane)
-        at = (torch.arange(_FOCALS, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
-        focal = (at[:, None].to(plane) * problem.free_focal.width).exp()[..., None, None]  # (F, B, 1, 1)
+            return minimal_poses(problem.world_points, plane)
+        at = (torch.arange(_FOCALS, dtype=plane.dtype, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
+        focal = (at[:, None] * problem.free_focal.width).exp()[..., None, None]  # (F, B, 1, 1)
         world = problem.world_points.expand(_FOCALS, -1, -1, -1)
-        (rotation, translation), valid = p3p(world, plane / focal)
+        (rotation, translation), valid = minimal_poses(world, plane / focal)
         one = torch.ones_like(focal)
         rows = torch.cat((one, one, one / focal), -1)
         pose = Pose(rotation * rows[..., None], translation * rows)

@@ -90,7 +90,7 @@ class RANSAC(Initialiser):
         >>> ransac = RANSAC(P3P(), threshold=6.0, world_threshold=0.3)
         >>> solver = PnPNet(ransac, RobustWeightedLM(m=0, robustness=0))
         >>> result = solver(problems.world_points, problems.img_points, problems.intrinsics)
-        >>> torch.equal(result.weights > 0, problems.inliers), result.ok.tolist()
+        >>> torch.equal(result.inliers, problems.inliers), result.ok.tolist()
         (True, [True, True, True, True])
     """
 
@@ -273,7 +273,8 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
         sigma = (sigma * there).sum(-1, keepdim=True) / there.sum(-1, keepdim=True).clamp(min=1.0)
         limit = _INLIER * sigma
     else:
-        limit = torch.where(known.img.isfinite() & known.world.isfinite(), _KNOWN_INLIER, _INLIER) * sigma
+        is_known = known.img.isfinite() & known.world.isfinite()
+        limit = torch.where(is_known, sigma.new_full((), _KNOWN_INLIER), _INLIER) * sigma
     thresholds = Thresholds(limit, torch.zeros_like(depth))
     chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
     given = map_tensors(lambda *x: torch.stack(x, 1), *constant.poses)

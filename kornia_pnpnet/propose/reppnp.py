@@ -171,7 +171,8 @@ class REPPnP(Initialiser):
 
     def _keep(self, pairs: _Pairs, sq_error: Tensor, floor: int) -> Tensor:
         """Weights (B, N), 0 if the error exceeds the quantile and the limit. At least ``floor`` pairs are kept."""
-        rank = (self.quantile * pairs.there.sum(-1, keepdim=True)).ceil().long().clamp(min=floor)  # (B, 1)
+        count = pairs.there.sum(-1, keepdim=True, dtype=sq_error.dtype)  # (B, 1)
+        rank = (self.quantile * count).ceil().long().clamp(min=floor)
         rank = rank.clamp(max=sq_error.shape[-1]) - 1
         ascending = torch.where(pairs.there, sq_error, torch.inf).sort(-1).values
         kept = sq_error <= ascending.gather(-1, rank).clamp(min=self.max_error**2)
@@ -201,7 +202,7 @@ def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
 def _null_vector(rows: Tensor, weights: Tensor, depth_prior: float) -> tuple[Tensor, Tensor]:
     """Inverse normal matrix (B, 11, 11), and the null vector (B, 12, 1). The last entry is the centroid's depth 1."""
     normal = _normal_matrix(rows, weights)
-    inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8))
+    inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8).to(normal))
     return inverse, torch.cat((-(inverse @ normal[..., -1:]), torch.ones_like(normal[:, :1, :1])), 1)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import solve_positive
-from kornia_pnpnet.core.performance import compiling, present_first, sees_values
+from kornia_pnpnet.core.performance import compiling, present_first
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.judge.belief import pose_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge, median_residual, residual_noise
@@ -125,10 +125,7 @@ class Search:
         self.finds_rivals = finds_rivals
         self.plan, self.problem = plan, problem
         self.chances = torch.ones_like(problem.weights) if chances is None else chances
-        self.minimal = plan.minimal
-        if problem.rig is not None:  # without translations, all rays start at one point
-            central = sees_values(problem.weights) and not bool(problem.rig.translation.any())
-            self.minimal = P3PRig(0 if central else 8)
+        self.minimal = plan.minimal if problem.rig is None else P3PRig()
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, self.thresholds, _DTYPE)
@@ -388,7 +385,7 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
         fitted: see :func:`~kornia_pnpnet.judge.inliers.median_residual`.
     """
     median = median_residual(sq_residuals, there, fitted)  # median / (2 log 2) is the variance of a coordinate
-    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, there.sum(-1, keepdim=True)
+    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, there.sum(-1, keepdim=True, dtype=median.dtype)
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:

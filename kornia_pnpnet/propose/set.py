@@ -15,7 +15,7 @@ from kornia_pnpnet.core.performance import are_few, compiling, present_first, pr
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
-from kornia_pnpnet.propose.p3p import p3p
+from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.view import LEAST_NOISE, LOG_NOISE, View, repeats
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO, project
 from kornia_pnpnet.result import Pose
@@ -300,7 +300,7 @@ class SetInit(Initialiser):
         batch, count = chances.shape
         there = problem.usual_weights > 0
         # Unlikely pairs also contribute to scores, because they can be inliers. Padding does not contribute.
-        vote = torch.add(_LEAST_VOTE * there, chances, alpha=1.0 - _LEAST_VOTE)
+        vote = torch.add((1.0 - _LEAST_VOTE) * chances, there, alpha=_LEAST_VOTE)
         # The variance is computed at the depth of the network's pose. At the depth of a hypothesis close to the points,
         # the variance would be large, and most pairs would agree with the hypothesis.
         precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, fallback))
@@ -320,7 +320,7 @@ class SetInit(Initialiser):
         else:
             three = pairs[:6].index_select(1, torch.tensor(samples, device=pairs.device).mT.flatten())
         three = three.unflatten(1, (3, len(samples))).flatten(2)  # (6, 3, S B)
-        pose, valid = p3p(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
+        pose, valid = minimal_poses(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
         # In memory, the result of p3p has the dimensions: components, solutions, samples, problems.
         each = len(samples), batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
@@ -348,7 +348,7 @@ class SetInit(Initialiser):
     def _run(self, view: View) -> tuple[Tensor, Tensor]:
         """The outputs of the network for pairs (1 + 2 S, B, N), and for problems (B, S + 2)."""
         x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
-        absent = torch.where(view.there > 0, 0.0, _ABSENT).to(x.dtype).contiguous()
+        absent = torch.where(view.there > 0, x.new_zeros(()), _ABSENT).contiguous()
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)

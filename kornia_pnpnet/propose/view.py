@@ -113,7 +113,7 @@ def _frame(affine: Tensor, squares: Tensor) -> Tensor:
     eye = torch.eye(3, dtype=u.dtype, device=u.device)
     u = functional.normalize(u + 1e-6 * eye[0], dim=-1)
     # A reflection maps the z axis to u or to -u. The same reflection maps the x axis to a vector orthogonal to u.
-    sign = torch.where(u[:, 2:] < 0, -1.0, 1.0)
+    sign = torch.where(u[:, 2:] < 0, u.new_full((), -1.0), 1.0)
     orthogonal = eye[0] - (u[:, :1] / (1.0 + sign * u[:, 2:])) * (u + sign * eye[2])
     v = functional.normalize(v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal, dim=-1)
     return torch.stack((u, v, torch.linalg.cross(u, v)), 1)

@@ -14,7 +14,7 @@ from kornia_pnpnet.core.linalg import relative, solve_positive
 from kornia_pnpnet.core.performance import EAGER, Runner, per_problem, problems_last, repeat_problems
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.belief import believe, has_enough
+from kornia_pnpnet.judge.belief import LEAST_PROBABILITY, believe, has_enough
 from kornia_pnpnet.judge.evidence import Evidence, Mixture, at_pose, evidence, updated, votes
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.refine.information import complete_noise, information, is_known, sq_standardised
@@ -57,6 +57,7 @@ class Plan(NamedTuple):
         state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second state
             of every problem, and so on.
         known: whether the caller gave the noise of a problem, bool, :math:`(B, 1)`.
+        world_sigma: the caller's standard deviation of each point, 0 where unknown, :math:`(B, N)`.
         votes: votes of the pairs, see :func:`~kornia_pnpnet.judge.evidence.votes`, :math:`(B, N)`.
         hyperparameters: step :math:`\gamma`, damping :math:`\lambda` and the kernel's shape of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
@@ -68,6 +69,7 @@ class Plan(NamedTuple):
     by_residual: Tensor
     state: State
     known: Tensor
+    world_sigma: Tensor
     votes: Tensor
     hyperparameters: tuple[tuple[Tensor, Tensor, Tensor], ...]
     starts: int
@@ -247,10 +249,11 @@ class RobustWeightedLM(Configured):
         """
         check_whole(0, m=m)
         by_residual = max(self.by_residual + m - self.m, 0) if self.by_residual else 0
-        refine = RobustWeightedLM(**{**self.config, "m": m, "by_residual": by_residual})
-        for name, parameter in refine.named_parameters():
-            trained = self.get_parameter(name).detach()
-            parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
+        with self.step.raw.device:
+            refine = RobustWeightedLM(**{**self.config, "m": m, "by_residual": by_residual})
+            for name, parameter in refine.named_parameters():
+                trained = self.get_parameter(name).detach()
+                parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
         return refine
 
     def forward(
@@ -277,6 +280,7 @@ class RobustWeightedLM(Configured):
         """Run everything before the first iteration. See :meth:`forward` for the arguments."""
         each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
         known = is_known(problem)
+        given = problem.noise
         problem = problems_last(problem._replace(noise=complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
         # A common factor of the weights does not change a step. The division prevents underflow of products of tiny
@@ -290,8 +294,9 @@ class RobustWeightedLM(Configured):
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
             camera = starts.camera.repeat(len(poses), 1)
+        world_sigma = torch.zeros_like(prior) if given is None else problems_last(given.world.nan_to_num(0.0))
         weights, state = (prior, guided, by_residual), State(pose, camera)
-        return Plan(problem, *weights, state, known, votes(problem), tuple(each), len(poses))
+        return Plan(problem, *weights, state, known, world_sigma, votes(problem), tuple(each), len(poses))
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[Plan, Progress]:
         """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
@@ -334,53 +339,52 @@ class RobustWeightedLM(Configured):
         assert now.mixture is not None
         problem = plan.problem._replace(weights=plan.by_residual)
         step, damping = (per_problem(x, plan.prior[:, 0]) for x in (step, damping))
-        projection = project(now.state, problem)
-        sq_residual, density, precision = at_pose(projection, problem)
-        unknowns = 6 + now.state.camera.shape[1]
-        mixture = updated(now.mixture, sq_residual, density, plan.votes, known, unknowns)
-        robust = mixture.weights(sq_residual, density) / mixture.variance
-        equations = self._equations(projection, problem, robust, precision)
-        state, solved = lm_step(equations, now.state, projection.focal, step, damping, additive=self.additive)
+        seen = at_pose(now.state, problem)
+        mixture = updated(now.mixture, seen, plan.votes, known)
+        equations = self._equations(seen.projection, problem, mixture.weights(seen) / mixture.variance, seen.precision)
+        state, solved = lm_step(equations, now.state, seen.projection.focal, step, damping, additive=self.additive)
         return Progress(state, solved, now.factor, mixture)
 
-    def judge(self, plan: Plan, now: Progress, found: Evidence | None = None) -> Refinement:
+    def judge(self, plan: Plan, now: Progress, found: Evidence | None = None, odds: Tensor | None = None) -> Refinement:
         """Run everything after the last iteration: compute evidence, weights, cost and ``ok`` of a state.
 
         Args:
             plan: the plan that :meth:`iterate` returned.
             now: the states that :meth:`iterate` returned.
             found: the evidence for the states, if it is known already.
+            odds: log-odds of the poses against their rivals, shape :math:`(B,)`; ``None``: no rivals.
         """
-        projection, shape = (
-            project(now.state, plan.problem),
-            per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1]),
-        )
-        cost = self._cost(projection, plan.problem, plan.prior, shape)
+        seen, shape = at_pose(now.state, plan.problem), per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
         if found is None:
-            found = evidence(projection, plan.problem, plan.votes, plan.known)
+            found = evidence(seen, plan.problem, plan.votes, plan.known)
         if now.mixture is None:
-            robust = self.kernel.weight(information(projection, plan.problem)[0], shape)
+            robust = self.kernel.weight(information(seen.projection, plan.problem)[0], shape)
         else:
-            robust = found.mixture.weights(*at_pose(projection, plan.problem)[:2])
-        weights = torch.where(projection.in_front, plan.prior * robust, 0.0)
-        probability, ok, sigma = believe(projection, plan.problem, found, plan.known)
-        in_front = has_enough(projection, plan.prior)
+            robust = found.mixture.weights(seen)
+        weights = torch.where(seen.projection.in_front, plan.prior * robust, 0.0)
+        cost = self._cost(seen.projection, plan.problem, plan.prior, shape)
+        probability, ok, sigma = believe(seen, plan.problem, found, plan.known)
+        if odds is not None:
+            probability = probability * odds.sigmoid()
+            ok = ok & (probability >= LEAST_PROBABILITY)
+        in_front = has_enough(seen.projection, plan.prior)
         return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
         """Fit a mixture to the residuals, and let them choose the noise that an initialiser estimated.
 
         The noise of the points adds to the noise of the pixels at small depths. If the residuals are likelier without
-        noise of the points, the estimated noise of the points becomes 0.
+        noise of the points, the estimated noise of the points becomes 0. Noise from the caller does not change.
         """
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
-            found = evidence(project(now.state, problem), problem, plan.votes, plan.known)
+            found = evidence(at_pose(now.state, problem), problem, plan.votes, plan.known)
             return plan, now._replace(mixture=found.mixture)
-        of_pixels = noise._replace(world=torch.where(plan.known, noise.world, 0.0))
+        of_pixels = noise._replace(world=plan.world_sigma)
         both = map_tensors(lambda x, y: torch.cat((x.mT, y.mT), 1).mT, noise, of_pixels)
         state, problem, votes, known = repeat_problems((now.state, problem, plan.votes, plan.known), 2)
-        found = evidence(project(state, problem), problem._replace(noise=both), votes, known)
+        problem = problem._replace(noise=both)
+        found = evidence(at_pose(state, problem), problem, votes, known)
         batch = plan.votes.shape[0]
         first, second = found.likelihood.view(2, batch)
         other = (second > first + _EXPECTED).long()
@@ -455,12 +459,11 @@ class RobustWeightedLM(Configured):
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
-            projection = project(at, problem)
             if mixture is None:
+                projection = project(at, problem)
                 return self._equations(projection, problem, *self._robust(projection, problem, shape))
-            sq_residual, density, precision = at_pose(projection, problem)
-            robust = mixture.weights(sq_residual, density) / mixture.variance
-            return self._equations(projection, problem, robust, precision)
+            seen = at_pose(at, problem)
+            return self._equations(seen.projection, problem, mixture.weights(seen) / mixture.variance, seen.precision)
 
         mixture, state = now.mixture, now.state
         weights = plan.guided if mixture is None else plan.by_residual

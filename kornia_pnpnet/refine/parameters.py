@@ -47,7 +47,7 @@ class BoundedParameter(nn.Module):
         self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)
         share = ((math.log(initial) if logarithmic else initial) - self._lower) / (self._upper - self._lower)
         # The logit of a bound is infinite and could not be saved. The sigmoid of the clamped logit is still 0 or 1.
-        self.raw = nn.Parameter(torch.full((size,), share).logit().clamp(-_BOUND, _BOUND))
+        self.raw = nn.Parameter(torch.full((size,), share, dtype=torch.float32).logit().clamp(-_BOUND, _BOUND))
 
     def forward(self) -> Tensor:
         """Return the bounded values, shape ``(size,)``."""

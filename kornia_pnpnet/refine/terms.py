@@ -14,6 +14,7 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.core.checks import check_shapes
 from kornia_pnpnet.core.performance import compiling
 from kornia_pnpnet.problem import Linear, State
 from kornia_pnpnet.refine.residual import NormalEquations
@@ -40,7 +41,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     The prior says nothing about heading and position.
 
     Args:
-        world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`.
+        world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`; :math:`B` stands
+            for any number of leading dimensions, also for none.
         cam_down: measured direction of gravity in the camera's axes (+z forward), of any non-zero length, shape
             :math:`(B, 3)`.
         sigma: standard deviation of the measured direction in radians, a number or :math:`(B,)`. The errors about both
@@ -60,8 +62,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
         >>> prior.information.diagonal(dim1=1, dim2=2).round()
         tensor([[10000.,     0., 10000.,     0.,     0.,     0.]])
     """
-    KORNIA_CHECK_SHAPE(world_down, ["B", "3"])
-    KORNIA_CHECK_SHAPE(cam_down, ["B", "3"])
+    KORNIA_CHECK_SHAPE(world_down, ["*", "3"])
+    check_shapes({"cam_down": (cam_down, tuple(world_down.shape))})
     KORNIA_CHECK(isinstance(sigma, Tensor) or sigma > 0, f"sigma must be positive, got {sigma}.")
     a, b = (functional.normalize(x, dim=-1) for x in (world_down, cam_down))
     eye = torch.eye(3, dtype=b.dtype, device=b.device)
@@ -70,9 +72,9 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     across = torch.linalg.cross(a, eye[a.detach().abs().argmin(-1)])
     opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
     middle = functional.normalize(torch.where(opposite, across, a + b), dim=-1)
-    rotation = 2.0 * middle[:, :, None] * middle[:, None] - eye
-    precision = torch.as_tensor(sigma, dtype=b.dtype, device=b.device).expand(b.shape[:1]).square().reciprocal()
-    known = precision[:, None, None] * (eye - b[:, :, None] * b[:, None])
+    rotation = 2.0 * middle[..., :, None] * middle[..., None, :] - eye
+    precision = torch.as_tensor(sigma, dtype=b.dtype, device=b.device).expand(b.shape[:-1]).square().reciprocal()
+    known = precision[..., None, None] * (eye - b[..., :, None] * b[..., None, :])
     information = functional.pad(known, (0, 3, 0, 3))
     return PosePrior(Pose(rotation, torch.zeros_like(b)), information)
 
@@ -155,29 +157,29 @@ class PoseTerm(NamedTuple):
     rank: Tensor
 
     @classmethod
-    def of(cls, prior: PosePrior, centroid: Tensor, scale: Tensor) -> tuple[PoseTerm, Tensor]:
+    def of(cls, prior: PosePrior, centroid: Tensor, size: Tensor) -> tuple[PoseTerm, Tensor]:
         """Express a prior in the frame of a problem.
 
         Args:
             prior: the prior in the world of the caller.
             centroid: the world point that became the origin, (B, 3).
-            scale: lengths of the problem per unit of the caller's world, (B,).
+            size: the length in the caller's world that became 1, (B,).
 
         Returns:
             First, the term. Second, whether the prior is usable (see ``_is_usable``), bool (B,). The information of an
             unusable prior becomes 0.
         """
-        usable = _is_usable(prior)
+        lengths = torch.cat((torch.ones_like(centroid), size[:, None].expand(-1, 3)), -1)
+        usable = _is_usable(prior, lengths)
         eye = torch.eye(3, dtype=centroid.dtype, device=centroid.device)
         rotation = torch.where(usable[:, None, None], prior.pose.rotation, eye)
         translation = torch.where(usable[:, None], prior.pose.translation, 0.0)
         information = torch.where(usable[:, None, None], prior.information, 0.0)
-        offset = centroid * scale[:, None]
-        moved = translation * scale[:, None] + (rotation * offset[:, None]).sum(-1)
-        lengths = torch.cat((torch.ones_like(centroid), scale.reciprocal()[:, None].expand(-1, 3)), -1)
+        offset = centroid / size[:, None]
+        moved = translation / size[:, None] + (rotation * offset[:, None]).sum(-1)
         information = information * lengths[:, :, None] * lengths[:, None]
         rank = (_correlations(information)[0] > _KNOWN).sum(-1).to(centroid)
-        widest = torch.full_like(scale, _SCALE) if prior.scale is None else torch.where(usable, prior.scale, _SCALE)
+        widest = torch.full_like(size, _SCALE) if prior.scale is None else torch.where(usable, prior.scale, _SCALE)
         sq_scale = 0.5 * widest.square() * rank.clamp(min=1.0)
         return cls(
             Pose(rotation, moved), information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank
@@ -248,9 +250,13 @@ class PoseTerm(NamedTuple):
         return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
 
 
-def _is_usable(prior: PosePrior) -> Tensor:
-    """Whether numbers are bounded, the scale is positive, and the information is positive semi-definite, bool (B,)."""
-    numbers = [prior.pose.rotation, prior.pose.translation, prior.information]
+def _is_usable(prior: PosePrior, lengths: Tensor) -> Tensor:
+    """Whether numbers are bounded, the scale is positive, and the information is positive semi-definite, bool (B,).
+
+    The entries of ``lengths`` (B, 6) are units of a tangent vector.
+    """
+    information = prior.information * lengths[:, :, None] * lengths[:, None]
+    numbers = [prior.pose.rotation, prior.pose.translation / lengths[:, 3:], information]
     limit = torch.finfo(prior.information.dtype).max ** 0.25
     fine = torch.stack([(x.detach().flatten(1).abs() < limit).all(1) for x in numbers]).all(0)
     if prior.scale is not None:

@@ -8,11 +8,11 @@ from pathlib import Path
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.training.results import RunResults
 
-__all__ = ["write_model_card"]
+__all__ = ["HOW_IT_RAN", "write_model_card"]
 
 _TAGS = ["camera-pose-estimation", "kornia", "perspective-n-point", "pnp"]
-# Overrides that do not change the results of a run.
-_HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
+#: Overrides that do not change the results of a run.
+HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
 # Matches absolute paths, but not the slashes of a URL or of a relative path.
 _PATH = re.compile(r"(?:file://|(?<![\w./\\])(?:~|[A-Za-z]:)?)(?:/(?!/)|\\)[^\s,;'\"\]})]*")
 _CARD = """---
@@ -80,7 +80,7 @@ def _describe(results: RunResults) -> str:
         key, _, value = override.partition("=")
         if key == "weights" and results.origin is not None and _PATH.fullmatch(value):
             words.append(f"weights=outputs/{results.origin.name}/weights")  # where `train.py` writes weights
-        elif key not in _HOW_IT_RAN:
+        elif key not in HOW_IT_RAN:
             words.append(_PATH.sub("PATH", override))
     start = f", from the weights of {results.origin.name}" if results.origin else ""
     made = f"{results.run.update} updates{start}, commit {results.environment['commit']}"

@@ -111,11 +111,15 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
     Raises:
-        TrainingError: when the file is damaged, or when ``identity`` differs from the identity in the file.
+        TrainingError: when the file is damaged, or when ``identity`` differs from the identity in the file, except by
+            a larger number of updates.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        found = differences(state["identity"], identity)
+        before, now = ({**x, "settings": dict(x["settings"])} for x in (state["identity"], identity))
+        if before["settings"]["updates"] < now["settings"]["updates"]:  # a run may become longer
+            del before["settings"]["updates"], now["settings"]["updates"]
+        found = differences(before, now)
     except Exception as error:  # torch.load raises many types on a damaged file
         raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
     if found:

@@ -9,9 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-import resource
 import shutil
-import sys
 import timeit
 from collections.abc import Mapping
 from contextlib import closing
@@ -29,6 +27,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
+from kornia_pnpnet.core.environment import peak_resident_bytes
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.stream import ProblemSource, stream_batches
@@ -54,6 +53,7 @@ _log = logging.getLogger(__name__)
 
 # Stages of an update. "rest" consists of learning curves, validations and checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
+_REFINES = "with refinement"  # label of the progress bar
 # Columns of the learning curves, except the columns of validations.
 _COLUMNS = (
     *("update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"),
@@ -152,7 +152,8 @@ def fit(
         folder: folder of the run.
         fabric: a launched Fabric; one process on the CPU when ``None``.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
-            only with an equal ``identity``.
+            only with an equal ``identity`` and equal settings, except that ``settings.updates`` may grow. The learning
+            rates and the ramp then continue as in a run of the larger number of updates.
         data_workers: number of worker processes for each training process, see
             :func:`~kornia_pnpnet.data.stream.stream_batches`.
         resume: continue from the checkpoint in ``folder`` if it exists.
@@ -180,7 +181,19 @@ def fit(
         if not resume:
             raise TrainingError(f"{checkpoint} exists: pass resume=true to continue, or choose another folder.")
         state = load_checkpoint(checkpoint, described)
-        start, skipped = state["update"], state["skipped"]
+        start, skipped, planned = state["update"], state["skipped"], state["identity"]["settings"]["updates"]
+        if planned < settings.updates:
+            _log.warning(
+                "The run becomes longer: %s updates instead of %s. From update %s on, the schedule is that of the "
+                "longer run: learning rate %.2g, ramp of the refinement %.2g.",
+                *(
+                    settings.updates,
+                    planned,
+                    start,
+                    settings.lr * settings.lr_factor(start),
+                    settings.ramp_factor(start),
+                ),
+            )
         model.load_state_dict(state["model"])
 
     groups = []
@@ -199,7 +212,10 @@ def fit(
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
     part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
     hidden = not (progress and fabric.is_global_zero)
-    bar = tqdm(total=settings.updates, initial=start, disable=hidden, unit="update")
+    # An update of the network alone is much faster than one with the refinement. Each phase has a bar and a speed.
+    alone = min(settings.updates, math.ceil(settings.ramp[0] * settings.updates))
+    phase = ("network alone", alone) if start < alone else (_REFINES, settings.updates)
+    bar = tqdm(None, *phase, initial=start, disable=hidden, unit="update", smoothing=0.0)
     batches = stream_batches(data, start, settings.updates, data_workers)
     clock = StageClock(*_STAGES)
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
@@ -207,6 +223,10 @@ def fit(
         for update, batch in enumerate(batches, start + 1):
             problems = batch.map(lambda x: x[part].to(fabric.device))
             clock.lap("data")
+            if update - 1 == bar.total:
+                bar.reset(settings.updates)
+                bar.initial = bar.n = update - 1
+                bar.set_description(_REFINES)
             factor, ramp = settings.lr_factor(update - 1), settings.ramp_factor(update - 1)
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
@@ -249,6 +269,7 @@ def fit(
                     row |= {name: getattr(report, name) for name in ("updates_per_second", "peak_memory_mib")}
                     row |= {f"{stage}_share": share for stage, share in report.time_shares.items()}
                     if validates:
+                        bar.set_postfix_str("validating")
                         model.eval()
                         results = validate(model, validation)
                         model.train()
@@ -307,8 +328,8 @@ def _report(
     whole = max(sum(spent.values()), 1e-9)
     if fabric.device.type == "cuda":
         memory = torch.cuda.max_memory_allocated(fabric.device) / 2**20
-    else:  # ru_maxrss is in bytes on macOS and in KiB elsewhere
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2 ** (20 if sys.platform == "darwin" else 10)
+    else:
+        memory = peak_resident_bytes() / 2**20
     return FitReport(
         start=start,
         update=update,

@@ -36,9 +36,9 @@ __all__ = [
 ]
 
 RESULTS_NAME = "results.json"
-# Problems per timed call, and number of timed calls. The shortest time is reported, because other work on the
-# machine only adds time.
-_TIMED_PROBLEMS, _TIMED_CALLS = 1000, 20
+# Problems per timed call, and largest number and seconds of timed calls. The shortest time is reported, because other
+# work on the machine only adds time.
+_TIMED_PROBLEMS, _TIMED_CALLS, _TIMED_SECONDS = 1000, 20, 5.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class FitReport:
         seconds: wall-clock time of this call.
         updates_per_second: average speed of this call.
         time_shares: share of ``seconds`` by stage: data (waiting), forward, backward, optimizer and rest.
-        peak_memory_mib: peak resident memory of this process; on a GPU, peak memory that PyTorch allocated.
+        peak_memory_mib: peak resident memory of this process, 0 on Windows; on a GPU, the peak that PyTorch allocated.
     """
 
     start: Count
@@ -194,7 +194,9 @@ def run_results(
     *_, last = validation.values()
     part = last.map(lambda x: x[:_TIMED_PROBLEMS])
     inputs = part.world_points, part.img_points, part.intrinsics
-    seconds = timeit.repeat(lambda: model(*inputs, **part.known), number=1, repeat=_TIMED_CALLS)
+    seconds: list[float] = []
+    while len(seconds) < _TIMED_CALLS and sum(seconds) < _TIMED_SECONDS:
+        seconds.append(timeit.timeit(lambda: model(*inputs, **part.known), number=1))
     learned = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
     model_config: Any = model.config()
     made_with: Any = environment()
@@ -254,15 +256,17 @@ def summarize_runs(folder: str | Path) -> Path | None:
         OSError: when the summary cannot be written.
     """
     folder = Path(folder)
-    rows = []
+    rows: list[dict[str, Any]] = []
+    overrides: dict[str, None] = {"run": None}  # the first columns
     for path in sorted(folder.glob(f"**/{RESULTS_NAME}")):
         try:
             results = load_run(path)
         except ValueError as error:
             warnings.warn(f"Left out of the summary: {error}", stacklevel=2)
             continue
-        row: dict[str, Any] = {"run": str(path.parent.relative_to(folder))}
+        row = {"run": str(path.parent.relative_to(folder))}
         row |= dict(override.lstrip("+").partition("=")[::2] for override in results.overrides)
+        overrides |= dict.fromkeys(row)
         for key in ("update", "skipped", "updates_per_second", "peak_memory_mib"):
             row[key] = getattr(results.run, key)
         row["us_per_problem"] = f"{results.us_per_problem:.4g}"
@@ -272,5 +276,5 @@ def summarize_runs(folder: str | Path) -> Path | None:
     if not rows:
         return None
     # The file is written atomically, because parallel runs may write the summary at the same time.
-    write_csv(folder / "summary.csv", dict.fromkeys(key for row in rows for key in row), rows)
+    write_csv(folder / "summary.csv", overrides | dict.fromkeys(key for row in rows for key in row), rows)
     return folder / "summary.csv"

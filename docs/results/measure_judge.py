@@ -1,0 +1,153 @@
+"""Measure what each part of the judge is worth: every part is switched off in turn. ``make.py`` is the command."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import numpy as np
+import torch
+from measure_probability import ARGUMENTS, kinds
+from torch import Tensor
+
+from kornia_pnpnet import Pose
+from kornia_pnpnet.core.environment import environment
+from kornia_pnpnet.data import ObjectPoints, OutlierMix, SceneProblems, SyntheticProblems, load_scene
+from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.judge import belief, evidence
+from kornia_pnpnet.metrics import pose_errors
+from kornia_pnpnet.propose import alternatives
+from kornia_pnpnet.refine.lm import RobustWeightedLM
+
+_SYNTHETIC = ("matches, 9 pairs", "matches, 50 pairs", "uniform, 9 pairs")
+_AT_ONCE = 60  # problems of real matches in a call
+
+
+def _one_of_each(rows: Tensor, there: Tensor) -> Tensor:
+    """No pair is a copy."""
+    return torch.ones_like(rows[..., 0])
+
+
+def _keeps_noise(self: RobustWeightedLM, plan: Any, now: Any) -> Any:
+    """The estimated noise of the points stays."""
+    seen = evidence.at_pose(now.state, plan.problem)
+    return plan, now._replace(mixture=evidence.evidence(seen, plan.problem, plan.votes, plan.known).mixture)
+
+
+def _any_points(world_points: Tensor, inliers: Tensor) -> Tensor:
+    return inliers.any(-1)
+
+
+#: Each part of the judge: the object, the name in the object, and the value that switches the part off.
+PARTS: dict[str, tuple[Any, str, Any]] = {
+    "wide inliers": (evidence, "_TAIL", 0.0),
+    "votes of copies": (evidence, "copies", _one_of_each),
+    "choice of the points' noise": (RobustWeightedLM, "shown", _keeps_noise),
+    "rival of larger noise": (alternatives, "_GAP", -math.inf),
+    "rival of the search": (alternatives, "_APART", math.inf),
+    "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
+    "limit of the pose's standard deviation": (belief, "_OPEN", math.inf),
+    "limit of the noise": (belief, "_MOST_NOISE", math.inf),
+    "points off a line": (belief, "_leave_a_line", _any_points),
+}
+
+
+class Set(NamedTuple):
+    """Problems: inputs, true pose, the usual distance of the points, and the largest errors of a solved problem.
+
+    The second limit is in the unit of the world if ``relative`` is false, and otherwise a share of the distance.
+    """
+
+    name: str
+    inputs: dict[str, Any]
+    truth: Pose
+    distance: Tensor
+    limits: tuple[float, float]
+    relative: bool = True
+
+
+def sets(scenes: Path, seed: int) -> Iterator[Set]:
+    """Synthetic problems, a clean scene, outdoor matches, indoor matches with depth maps, and keypoints of objects."""
+    for kind in kinds(seed):
+        if kind.name in _SYNTHETIC and kind.truth is not None:
+            yield Set(f"synthetic, {kind.name}", kind.inputs, kind.truth, kind.distance, (2.0, 0.05))
+    objects = SyntheticProblems(
+        n=12,
+        batch_size=500,
+        seed=seed,
+        points=ObjectPoints(),
+        outliers=OutlierMix(max_ratio=0.4, mismatch_share=0.5),
+        half_image=None,
+        img_sigma=(2.0, 20.0),
+        world_sigma=0.0,
+        degrees=(2.0, 8.0),
+    )
+    door = SceneProblems(load_scene(scenes / "colmap" / "lund_door"), n=9, batch_size=1000, seed=seed)
+    for name, source, limits in (
+        ("keypoints, synthetic", objects, (5.0, 0.05)),
+        ("lund_door, 9 pairs", door, (1.0, 0.005)),
+    ):
+        p = source.batch(0)
+        yield Set(
+            name, dict(zip(ARGUMENTS, p[:3], strict=True)), p.pose, p.true_cam_points[..., 2].median(1).values, limits
+        )
+    for name, file, limits, relative in (
+        ("outdoor matches", "raw/by_image.npz", (1.0, 0.01), True),
+        ("indoor matches, RGB-D", "rgbd/indoor.npz", (5.0, 0.05), False),
+    ):
+        read = np.load(scenes / file)
+        x = {key: torch.from_numpy(read[key]) for key in ("W", "I", "M", "K", "R", "t", "kind")}
+        for number, label in ((0, "ratio test"), (1, "no ratio test")):
+            world, img, mask, cameras, rotation, translation = (x[key][x["kind"] == number] for key in "WIMKRt")
+            inputs = {"world_points": world.float(), "img_points": img.float(), "intrinsics": cameras.float()}
+            truth = Pose(rotation.float(), translation.float())
+            depth = (world.float() @ truth.rotation.mT + truth.translation[:, None])[..., 2]
+            distance = depth.where(mask, torch.nan).nanmedian(1).values
+            yield Set(f"{name}, {label}", {**inputs, "mask": mask}, truth, distance, limits, relative)
+
+
+@torch.no_grad()
+def measure_judge(scenes: Path, seed: int) -> dict[str, Any]:
+    """Solved problems, and far-off poses that are ``ok``, with the whole judge and without each part."""
+    made: dict[str, Any] = {"environment": environment(), "sets": {}}
+    for one in sets(scenes, seed):
+        whole = judged(one)
+        rows = {"": summary(whole, whole)}
+        for part, (owner, name, value) in PARTS.items():
+            with ExitStack() as stack:
+                stack.enter_context(mock.patch.object(owner, name, value))
+                rows[part] = summary(whole, judged(one))
+        made["sets"][one.name] = rows
+        print(one.name, rows[""], flush=True)
+    return made
+
+
+def judged(one: Set) -> dict[str, Tensor]:
+    """Solve a set: which poses are right, far off, and ``ok``."""
+    solver, size = load_solver("pnpnet-set"), len(one.distance)
+    at_once = _AT_ONCE if "mask" in one.inputs else size
+    results = [solver(**{key: x[i : i + at_once] for key, x in one.inputs.items()}) for i in range(0, size, at_once)]
+    pose = Pose(*(torch.cat([getattr(x, key) for x in results]) for key in ("rotation", "translation")))
+    turn = pose_errors(pose, one.truth).rotation_error_deg
+    centres = [-(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (pose, one.truth)]
+    shift = (centres[0] - centres[1]).norm(dim=-1)
+    unit = one.distance if one.relative else 1.0
+    right = (turn < one.limits[0]) & (shift < one.limits[1] * unit)
+    far = (turn > 10.0) | (shift > 0.3 * one.distance)
+    return {"right": right, "far": far, "ok": torch.cat([x.ok for x in results])}
+
+
+def summary(whole: dict[str, Tensor], found: dict[str, Tensor]) -> dict[str, float]:
+    """Shares of solved problems and of far-off poses that are ``ok``; the standard error compares with the whole."""
+    right, count = found["right"], len(found["right"])
+    return {
+        "count": count,
+        "success": right.double().mean().item(),
+        "error": (right != whole["right"]).sum().item() ** 0.5 / count,
+        "far_ok": (found["far"] & found["ok"]).double().mean().item(),
+        "ok_of_right": found["ok"][right].double().mean().item(),
+    }

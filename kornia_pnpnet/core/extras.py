@@ -1,0 +1,37 @@
+"""Packages that only some parts of the library need, and how to install them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+__all__ = ["how_to_install", "needs"]
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra. No package index has this library yet."""
+    return f"in a clone of kornia_pnpnet, pip install '.[{extra}]'"
+
+
+@contextmanager
+def needs(extra: str, message: str) -> Iterator[None]:
+    """Import packages of an extra.
+
+    Args:
+        extra: key of the optional dependencies in ``pyproject.toml``.
+        message: what needs which packages, as the first part of an error message.
+
+    Raises:
+        ImportError: when an import in the block fails. The message names the command that installs the extra.
+
+    Example:
+        >>> with needs("eval", "Pictures need matplotlib"):
+        ...     import a_missing_package
+        Traceback (most recent call last):
+        ...
+        ImportError: Pictures need matplotlib: in a clone of kornia_pnpnet, pip install '.[eval]'
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f"{message}: {how_to_install(extra)}") from error

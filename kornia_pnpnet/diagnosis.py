@@ -1,0 +1,160 @@
+"""Find the wrong convention that keeps the pairs of a problem from agreeing with a pose."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from kornia.core.exceptions import ShapeError
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from kornia_pnpnet.arguments import checked_inputs
+from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.frame import Normalize
+from kornia_pnpnet.judge.belief import believe
+from kornia_pnpnet.judge.evidence import at_pose, evidence, votes
+from kornia_pnpnet.problem import State
+from kornia_pnpnet.registry import create_solver
+from kornia_pnpnet.result import Pose
+
+__all__ = ["Diagnosis", "Trial", "diagnose"]
+
+# Two trials are equally good if their evidence per pair differs by less than this number, which is the difference
+# between noise of 1 px and noise of 1.28 px. Flipped pixels are also the pixels of a mirrored world.
+_EQUAL = 0.5
+
+
+class Trial(NamedTuple):
+    """How well the pairs agree with the best pose after one change.
+
+    Attributes:
+        change: the change of the input.
+        evidence: the evidence for the pose divided by the number of pairs, see :mod:`kornia_pnpnet.judge.evidence`.
+        agree: share of the pairs that are inliers.
+        sigma: standard deviation of a pixel coordinate that the inliers show, in pixels.
+        ok: whether the pose is believed; of a batch, whether most poses are.
+    """
+
+    change: str
+    evidence: float
+    agree: float
+    sigma: float
+    ok: bool
+
+
+class Diagnosis(NamedTuple):
+    """The result of :func:`diagnose`. Its ``str`` is one sentence.
+
+    Attributes:
+        trials: all trials. The first trial is the input as given.
+        best: the trials that make the pairs agree, equally well; empty if no change does. If no change, or a change of
+            the pose, suffices, this trial is the only one.
+    """
+
+    trials: tuple[Trial, ...]
+    best: tuple[Trial, ...]
+
+    def __str__(self) -> str:
+        def text(trial: Trial, of: str = "") -> str:
+            return f"{100.0 * trial.agree:.0f} %{of} to {float(f'{trial.sigma:.2g}'):g} px"  # no exponent
+
+        given = self.trials[0]
+        before = f"{given.change}: {text(given)}"
+        if not self.best:
+            return f"no usual mistake explains the pairs ({before})"
+        changes = " or ".join(trial.change for trial in self.best)
+        found = f"{changes}: {text(self.best[0], ' of the pairs agree')}"
+        return found if given in self.best else f"{found} ({before})"
+
+
+@torch.no_grad()
+def diagnose(
+    world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, *, pose: Pose | None = None
+) -> Diagnosis:
+    """Try the usual mistakes in conventions, and tell which of them makes the pairs agree.
+
+    The mistakes are swapped pixel coordinates, a y axis that points up, a left-handed world, an incorrect principal
+    point, an incorrect focal length, the intrinsics of a resized image, normalised coordinates in place of pixels, and
+    a camera-to-world pose. The solver ``pnpnet-set`` solves the input after each change, and the judge of all solvers
+    compares the poses. The points of a plane look the same from behind in a mirror, so that they cannot show a mirrored
+    world, swapped coordinates or a flipped axis.
+
+    Args:
+        world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. All problems of a batch must
+            have the same convention.
+        img_points: pixels; see ``PnPNet.forward``.
+        intrinsics: see ``PnPNet.forward``. The largest pixel coordinates stand for the size of the image.
+        pose: a pose that the pairs should agree with. Without a pose the pairs should agree with any pose.
+
+    Raises:
+        BaseError: see ``PnPNet.forward``; also for bearings.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> p = SyntheticProblems(n=50, batch_size=1, seed=0).batch(0)
+        >>> found = diagnose(p.world_points, p.img_points.flip(-1), p.intrinsics)  # the principal point is 0
+        >>> [trial.change for trial in found.best]
+        ['swap u and v', 'flip y', 'mirror the world']
+    """
+    _, inputs = checked_inputs(world_points, img_points, intrinsics, init=pose)
+    if inputs.rig is not None:
+        raise ShapeError(f"diagnose takes pixels (..., N, 2), got the shape {tuple(img_points.shape)}.")
+    given = inputs.world_points, inputs.img_points, inputs.intrinsics / inputs.intrinsics[:, 2:, 2:]
+    changed = _changed(*given)
+    names, batch = [*changed], tuple(torch.cat(x) for x in zip(*changed.values(), strict=True))
+    if inputs.init is not None:
+        names = [names[0], "invert the pose", "find another pose", *names[1:]]
+    for effort in ("fixed", "adaptive"):  # the search for the last pose takes long and is mostly not needed
+        solver = create_solver("pnpnet-set", effort=effort).to(world_points.device)
+        pairs, poses = batch, solver(batch[0], batch[1], batch[2]).pose
+        if inputs.init is not None:
+            rotation, translation = inputs.init
+            inverse = Pose(rotation.mT, -(rotation.mT @ translation[..., None])[..., 0])
+            poses = map_tensors(lambda *x: torch.cat(x), Pose(rotation, translation), inverse, poses)
+            pairs = tuple(torch.cat((x, x, more)) for x, more in zip(given, batch, strict=True))
+        trials = _judged(names, pairs, poses)
+        least = max((trial.evidence for trial in trials if trial.ok), default=0.0) - _EQUAL
+        best = tuple(trial for trial in trials if trial.ok and trial.evidence > least)
+        if best:
+            break
+    # A change of the pose, or no change, is simpler than a change of the pairs.
+    plain = [trial for trial in trials[: len(trials) - len(changed) + 1] if trial in best]
+    return Diagnosis(trials, tuple(plain[:1]) or best)
+
+
+def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[Trial, ...]:
+    """Judge the poses of each trial: (T * B) problems for T names."""
+    problem, frame = Normalize(order=False)(*pairs)
+    seen = at_pose(State.of(frame.apply(poses)), problem)
+    unknown = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
+    found = evidence(seen, problem, votes(problem), unknown)
+    ok = frame.valid & believe(seen, problem, found, unknown).ok
+    sigma = found.sigma * problem.focal / frame.img_scale
+    columns = found.log_ratio / problem.weights.shape[1], found.inlier.gt(0.5).to(sigma).mean(1), sigma, ok.to(sigma)
+    rows = torch.stack(columns, -1).unflatten(0, (len(names), -1)).median(1).values.tolist()  # of all problems
+    return tuple(Trial(name, a, b, c, believed > 0) for name, (a, b, c, believed) in zip(names, rows, strict=True))
+
+
+def _changed(world: Tensor, pixels: Tensor, cameras: Tensor) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
+    """Points (B, N, 3), pixels (B, N, 2) and cameras (B, 3, 3) after each change, for each mistake without a pose."""
+    centre, upright = cameras[:, None, :2, 2], pixels.new_tensor([1.0, -1.0])
+
+    def camera(focal: float, principal: float) -> Tensor:
+        return cameras * cameras.new_tensor([[focal, focal, principal], [focal, focal, principal], [1.0, 1.0, 1.0]])
+
+    central = camera(1.0, 0.0)
+    central[:, :2, 2] = pixels.amax((0, 1)) / 2.0
+    return {
+        "as given": (world, pixels, cameras),
+        "swap u and v": (world, pixels.flip(-1), cameras),
+        "flip y": (world, centre + upright * (pixels - centre), cameras),
+        "mirror the world": (world * world.new_tensor([1.0, 1.0, -1.0]), pixels, cameras),
+        "set the principal point to 0": (world, pixels, camera(1.0, 0.0)),
+        "set the principal point to half the image size": (world, pixels, central),
+        "halve the focal length": (world, pixels, camera(0.5, 1.0)),
+        "double the focal length": (world, pixels, camera(2.0, 1.0)),
+        "halve the intrinsics (resized image)": (world, pixels, camera(0.5, 0.5)),
+        "double the intrinsics (resized image)": (world, pixels, camera(2.0, 2.0)),
+        "multiply normalised coordinates by the intrinsics": (world, pixels @ cameras[:, :2, :2].mT + centre, cameras),
+    }
