@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.arguments import Inputs, checked_inputs, given_cameras, joined, restore_leading, split_batch
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
-from kornia_pnpnet.core.performance import Runner, in_full_precision, sees_values
+from kornia_pnpnet.core.performance import Runner, in_full_precision, in_turn, sees_values
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.core.watch import GradientWatch
 from kornia_pnpnet.frame import Frame, Normalize
@@ -258,7 +258,7 @@ class PnPNet(PretrainedMixin):
         check_whole(0, alternatives=alternatives)
         self._check_cameras(inputs, distorted=dist is not None or fisheye is not None, alternatives=alternatives)
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
-        with in_full_precision(inputs.world_points.device.type):
+        with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points):
             compiled = self._run.compiled or self._whole.compiled
             single = compiled and len(inputs.world_points) == 1 and not (self._run.failed or self._whole.failed)
             if compiled:  # a batch of one, or another memory layout, would need a new compilation

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import multiprocessing
+import os
 import pickle
+import threading
 import warnings
 
 import pytest
@@ -13,7 +16,7 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import INLINE, Compiled, ascending_order, in_order, ranked
+from kornia_pnpnet.core.performance import INLINE, Compiled, ascending_order, in_order, in_turn, ranked
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.result import PnPResult
@@ -338,3 +341,29 @@ def test_operations_that_are_inlined_give_the_same_results(function, inputs):
 def test_long_sorts_stay_calls():
     program = export(lambda x: x.sort(stable=True).indices, torch.randn(2, 1000))
     assert kernels(program.run_decompositions(INLINE)) == kernels(program) != set()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+def test_a_forked_process_does_not_wait_for_a_thread_of_its_parent():
+    held, done = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with in_turn(torch.ones(1)):
+            held.set()
+            done.wait()
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    held.wait()
+    process = multiprocessing.get_context("fork").Process(target=_take_a_turn)
+    process.start()
+    process.join(30)
+    done.set()
+    thread.join()
+    assert process.exitcode == 0
+
+
+def _take_a_turn() -> None:
+    with in_turn(torch.ones(1)):
+        pass

@@ -6,6 +6,8 @@ thread of an AMD EPYC.
 
 from __future__ import annotations
 
+import os
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -29,6 +31,7 @@ __all__ = [
     "fold_vmap",
     "in_full_precision",
     "in_order",
+    "in_turn",
     "keep_freed_memory",
     "package_options",
     "per_problem",
@@ -74,6 +77,20 @@ def in_full_precision(device: str) -> AbstractContextManager[Any]:
     if exporting() or not torch.amp.is_autocast_available(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
+
+
+_TURN = [threading.RLock()]
+if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even if a thread of its parent holds the lock
+    os.register_at_fork(after_in_child=lambda: _TURN.__setitem__(0, threading.RLock()))
+
+
+def in_turn(x: Tensor) -> AbstractContextManager[Any]:
+    """Return a context in which threads run one after the other, if ``x`` has few numbers (see :func:`are_few`).
+
+    Every operation on few numbers releases Python's lock and waits for it again. Four threads that wait for each other
+    at every operation are together two and a half times slower than one thread.
+    """
+    return _TURN[0] if are_few(x) else nullcontext()
 
 
 # Numbers. For fewer numbers on a CPU, the call of an operation takes longer than its arithmetic.
