@@ -67,7 +67,7 @@ def train(steps: int, seed: int) -> list[dict[str, Any]]:
     network, curve = Network(), []
     weights = {"params": network.heat.parameters()}, {"params": [network.log_sigma], "lr": 2e-2}
     optimizer = torch.optim.Adam(weights, 6e-3)
-    solver = create_solver("pnpnet-set", effort="fixed").requires_grad_(False)
+    solver = create_solver("pnpnet-set", effort="fixed")
     test_images, test_poses = draw(steps, TEST)
     for step in range(steps + 1):
         if step % (steps // 10) == 0:

@@ -11,7 +11,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from measure_probability import ARGUMENTS, kinds
+from measure_probability import ARGUMENTS, errors, kinds
 from torch import Tensor
 
 from kornia_pnpnet import Pose
@@ -19,7 +19,6 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data import ObjectPoints, OutlierMix, SceneProblems, SyntheticProblems, load_scene
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.judge import belief, evidence
-from kornia_pnpnet.metrics import pose_errors
 from kornia_pnpnet.propose import alternatives
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 
@@ -34,8 +33,7 @@ def _one_of_each(rows: Tensor, there: Tensor) -> Tensor:
 
 def _keeps_noise(self: RobustWeightedLM, plan: Any, now: Any) -> Any:
     """The estimated noise of the points stays."""
-    seen = evidence.at_pose(now.state, plan.problem)
-    return plan, now._replace(mixture=evidence.evidence(seen, plan.problem, plan.votes, plan.known).mixture)
+    return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
 
 
 def _any_points(world_points: Tensor, inliers: Tensor) -> Tensor:
@@ -132,9 +130,7 @@ def judged(one: Set) -> dict[str, Tensor]:
     at_once = _AT_ONCE if "mask" in one.inputs else size
     results = [solver(**{key: x[i : i + at_once] for key, x in one.inputs.items()}) for i in range(0, size, at_once)]
     pose = Pose(*(torch.cat([getattr(x, key) for x in results]) for key in ("rotation", "translation")))
-    turn = pose_errors(pose, one.truth).rotation_error_deg
-    centres = [-(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (pose, one.truth)]
-    shift = (centres[0] - centres[1]).norm(dim=-1)
+    turn, shift = errors(pose, one.truth)
     unit = one.distance if one.relative else 1.0
     right = (turn < one.limits[0]) & (shift < one.limits[1] * unit)
     far = (turn > 10.0) | (shift > 0.3 * one.distance)

@@ -107,15 +107,20 @@ def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
     log_ratio, sigma, probability = (torch.cat(x) for x in zip(*seen, strict=True))
     near = right = torch.zeros_like(result.ok)
     if kind.truth is not None:
-        turn = pose_errors(result.pose, kind.truth).rotation_error_deg
-        centres = [-(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (result.pose, kind.truth)]
-        shift = (centres[0] - centres[1]).norm(dim=-1) / kind.distance
+        turn, shift = errors(result.pose, kind.truth)
+        shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
     variables = torch.stack(belief.clipped(log_ratio, sigma), -1).double()
     # A rival multiplies the probability of the law. The fit leaves out poses that fail a test, and poses with a rival.
     alone = probability >= 0.99 * belief.probability(log_ratio, sigma)
     found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right}
     return {**found, "variables": variables, "alone": alone & (probability > 0)}
+
+
+def errors(pose: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
+    """Angles of the rotations in degrees, and distances of the camera centres."""
+    centres = [-(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (pose, truth)]
+    return pose_errors(pose, truth).rotation_error_deg, (centres[0] - centres[1]).norm(dim=-1)
 
 
 def rates(row: dict[str, Tensor]) -> dict[str, Any]:

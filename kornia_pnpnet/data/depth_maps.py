@@ -34,7 +34,8 @@ class DepthMaps:
     Args:
         depth_noise: range of :math:`a`, the noise at the mean distance :math:`\bar d`, relative to this distance. Each
             problem draws a log-uniform number.
-        angle: range of the standard deviation, in degrees, of a map camera's rotation about each axis, drawn likewise.
+        angle: range of the standard deviation, in degrees, of a map camera's rotation about each axis. Each problem
+            draws a log-uniform number.
         flying_share: probability that a point is a flying pixel.
         maps: number of map cameras of a problem.
 

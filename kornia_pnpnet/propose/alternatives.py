@@ -12,7 +12,7 @@ from kornia_pnpnet.core.linalg import eigenvectors
 from kornia_pnpnet.core.performance import repeat_problems
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.judge.belief import FAR_TURN
-from kornia_pnpnet.judge.evidence import Evidence, at_pose, evidence
+from kornia_pnpnet.judge.evidence import Evidence
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.scoring import as_entries, as_pose
@@ -69,7 +69,7 @@ def find_alternatives(
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
     plan = refine.begin(problem, starts._replace(pose=pose, others=None, camera=None))
     plan, now = refine.shown(plan, Progress.of(plan.state))
-    inlier = _shares(refine.judge(plan, now).evidence.inlier)
+    inlier = _shares(plan.evidence_at(now.state).inlier)
     middle, mirrored = _mean(problem.world_points, inlier), _mirrored(pose, problem, inlier)
     every = [*map(as_entries, (pose, mirrored)), *_of_three(problem, inlier, pose), *map(as_entries, starts.poses)]
     count, batch = len(every), inlier.shape[0]
@@ -126,7 +126,7 @@ def reconsider(
         log-odds against the rivals.
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
-    found = evidence(at_pose(now.state, problem), problem, plan.votes, plan.known)
+    found = plan.evidence_at(now.state)
     with torch.no_grad():
         inlier = _shares(found.inlier)
         mirrored = _mirrored(pose, problem, inlier)
@@ -158,7 +158,7 @@ def reconsider(
     step, damping, _ = plan.hyperparameters[-1]
     for i in range(_FROZEN + _FREE):
         tried = refine.by_residuals(every, tried, every.known | (i < _FROZEN), step, damping)
-    of_ends = evidence(at_pose(tried.state, every.problem), every.problem, every.votes, every.known)
+    of_ends = every.evidence_at(tried.state)
     # By kind of the rival (0: the refined pose) and by problem, (5, B).
     likelihood = found.likelihood.new_full((len(chosen) + 1, len(valid)), -torch.inf)
     end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()

@@ -74,6 +74,10 @@ class Plan(NamedTuple):
     hyperparameters: tuple[tuple[Tensor, Tensor, Tensor], ...]
     starts: int
 
+    def evidence_at(self, state: State) -> Evidence:
+        """The evidence for the poses of a state."""
+        return evidence(at_pose(state, self.problem), self.problem, self.votes, self.known)
+
 
 class Progress(NamedTuple):
     """What one iteration passes to the next iteration.
@@ -378,8 +382,7 @@ class RobustWeightedLM(Configured):
         """
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
-            found = evidence(at_pose(now.state, problem), problem, plan.votes, plan.known)
-            return plan, now._replace(mixture=found.mixture)
+            return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
         of_pixels = noise._replace(world=plan.world_sigma)
         both = map_tensors(lambda x, y: torch.cat((x.mT, y.mT), 1).mT, noise, of_pixels)
         state, problem, votes, known = repeat_problems((now.state, problem, plan.votes, plan.known), 2)
