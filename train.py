@@ -69,9 +69,8 @@ def main(config: DictConfig) -> float | None:
     if processes != fabric.world_size:
         sys.exit(f"torchrun started {processes} processes: pass engine.devices=... engine.strategy=ddp to match.")
     if fabric.is_global_zero:
-        parameters = sum(p.numel() for p in model.parameters() if p.requires_grad)
-        shape = f"n = {config.model.n}, m = {config.model.m}"
-        log.info("%s, %s parameters, %s processes", shape, parameters, fabric.world_size)
+        sizes = sum(p.numel() for p in model.parameters() if p.requires_grad), fabric.world_size
+        log.info("n = %s, m = %s, %s parameters, %s processes", config.model.n, config.model.m, *sizes)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
     settings = instantiate(config.train, _convert_="all")
     try:
@@ -116,9 +115,8 @@ def main(config: DictConfig) -> float | None:
         model.save_pretrained(folder / "weights")
         write_model_card(folder / "weights", results)
     for name, entry in results.validation.items():
-        log.info(
-            "%s (%s): success %s", name, config.data.get("about", {}).get(name, "see the configuration"), entry.success
-        )
+        about = config.data.get("about", {}).get(name, "see the configuration")
+        log.info("%s (%s): success %s", name, about, entry.success)
     log.info("Weights, model card and results are in %s", folder)
     if sweeps:
         summarize_runs(runtime.sweep.dir)
@@ -134,10 +132,8 @@ def continuing(*more: str) -> str:
 def start_from(model: PnPNet, trained: PnPNet) -> None:
     """Copy the weights of another solver. A refinement of another kind keeps its initial hyperparameters."""
     state = trained.state_dict()
-    kind, new = (
-        {key: x.refine.config[key] for key in ("m", "kernel", "shared", "by_residual")} for x in (trained, model)
-    )
-    if kind != new:
+    kind = {key: trained.refine.config[key] for key in ("m", "kernel", "shared", "by_residual")}
+    if not kind.items() <= model.refine.config.items():
         log.info("The weights are of a refinement with %s: only the network starts from the weights.", kind)
         state = {name: value for name, value in state.items() if not name.startswith("refine.")}
         state |= {f"refine.{name}": value for name, value in model.refine.state_dict().items()}

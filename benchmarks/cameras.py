@@ -22,7 +22,7 @@ import poselib
 import pycolmap
 import torch
 from contenders import random_cameras, relative_errors
-from harness import Column, Row, percent, pivot, share, target
+from harness import Row, pivot, share, target
 from torch import Tensor, nn
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, create_solver
@@ -330,23 +330,14 @@ def _solved(row: Row) -> str:
 
 def page(results: Row) -> str:
     """The tables as a page."""
-    cell: dict[str, Column] = {"Solver": "`{solver}`", "recall (%)": percent("success")}
-    cell |= {"median rotation (°)": "{median_rotation_deg:.4f}", "median focal (%)": percent("median_focal", 4)}
-    real: dict[str, Column] = {
-        **{"Matches": "{kind}", "Solver": "`{solver}`", "problems": "{count}", "solved (%)": percent("success")},
-        **{"solved, 5 % (%)": percent("success_5"), "far but ok (%)": percent("far_but_ok")},
-        **{"median focal error (%)": percent("median_focal", 2), "ms": lambda x: f"{x['us'] / 1000:,.1f}"},
-    }
     scene_keys = {"scene": "{scene}", f"outliers of {SCENE_N}": "{outliers}"}
     rig_keys = {"cameras": "{cameras}", "baseline": "{baseline}", "n": "{n}", "outliers": "{share:.0%}"}
     return harness.render(
         "cameras.md.jinja",
         results=results,
         pairs=CELL,
-        targets=harness.targets_table(targets(results)),
+        targets=targets(results),
         focal=pivot(results["focal"], {"n": "{n}", "outliers": "{share:.0%}"}, BY_FOCAL, _solved),
-        cell=harness.table(results["cell"], {**cell, "µs": "{us:,.0f}"}),
-        real=harness.table(results["real"], real),
         scenes=pivot(results["scenes"], scene_keys, BY_FOCAL, _solved),
         rigs=pivot(results["rigs"], rig_keys, ("pnpnet-set", "p3p-ransac:threshold=10", *RIG_PEERS), _solved),
     )

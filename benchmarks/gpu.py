@@ -11,14 +11,17 @@ import math
 import os
 import re
 import time
+import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import contenders
 import torch
 from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw, first
-from harness import HERE, in_turns, parser, say, share, summary
+from harness import HERE, in_turns, parser, say, share, summary, without_garbage_collection
 from timing import BACKWARD, FORWARD
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -35,6 +38,10 @@ LIMITS = {torch.float32: 1e-3, torch.float64: 1e-6}
 _DRAWN = 10_000  # problems; larger batches repeat them
 
 
+# Rotations (B, 3, 3), ``ok`` (B,), and gradients (B, 5 N).
+_Found = tuple[Tensor, Tensor, Tensor]
+
+
 class Amount(NamedTuple):
     """How much is measured. The first mode is what the others are compared with."""
 
@@ -43,6 +50,12 @@ class Amount(NamedTuple):
     graphs: tuple[str, ...] = ("pnpnet-n9", "pnpnet-set")
     modes: tuple[str, ...] = ("eager", "compiled", "reduce-overhead", "captured")
     calls: tuple[int, ...] = (1, 100, 1000)
+    directions: tuple[str, ...] = (FORWARD, BACKWARD)
+    # Solvers and efforts whose waits for the GPU are counted.
+    waits: tuple[tuple[str, str | None], ...] = (
+        *(("pnpnet-n9", "fixed"), ("pnpnet-n9", None)),
+        *(("pnpnet-set", "fixed"), ("pnpnet-set", None), ("p3p-ransac", None)),
+    )
     contenders: tuple[str, ...] = (
         *("pnpnet-n9", "pnpnet-n9 compiled", "pnpnet-set", "pnpnet-set compiled"),
         *("epnp-lm", "p3p-ransac", "poselib"),
@@ -57,7 +70,19 @@ class Amount(NamedTuple):
 
 FULL = Amount()
 #: A few small problems without compiling, which show that everything runs.
-QUICK = Amount(4, ("pnpnet-n9",), ("eager",), (1, 4), ("pnpnet-n9", "epnp-lm"), (4, 8), (9, 12), 3, 10.0, 2**16, 64)
+QUICK = Amount(
+    parity=4,
+    graphs=("pnpnet-n9",),
+    modes=("eager",),
+    calls=(1, 4),
+    waits=(),
+    contenders=("pnpnet-n9", "epnp-lm"),
+    batches=(4, 8),
+    pairs=(9, 12),
+    rounds=3,
+    copied=2**16,
+    side=64,
+)
 
 
 def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -107,8 +132,10 @@ def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype)
     return on_cpu, torch.cat([x.flatten(1) for x in filled], 1).cpu(), float(solved.double().mean())
 
 
-def reason(error: Exception) -> str:
-    """The start of an error's message, in one line."""
+def reason(error: BaseException) -> str:
+    """The start of the message of the error that caused an error, in one line."""
+    while error.__context__ is not None:
+        error = error.__context__
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
@@ -126,7 +153,7 @@ MODES: dict[str, dict[str, str] | None] = {
 }
 
 
-def captured(call: Callable[[], PnPResult]) -> Callable[[], PnPResult]:
+def captured(call: Callable[[], _Found]) -> Callable[[], _Found]:
     """The call as one CUDA graph, which is captured now and replayed by each call into the same result."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
@@ -135,10 +162,11 @@ def captured(call: Callable[[], PnPResult]) -> Callable[[], PnPResult]:
             call()
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    # Garbage can contain another graph, and to free a graph ends the capture.
+    with without_garbage_collection(), torch.cuda.graph(graph):
         result = call()
 
-    def replay() -> PnPResult:
+    def replay() -> _Found:
         graph.replay()
         return result
 
@@ -146,50 +174,92 @@ def captured(call: Callable[[], PnPResult]) -> Callable[[], PnPResult]:
 
 
 def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
-    """Time a call of each mode, of solvers with a fixed effort."""
-    for name in amount.graphs:
-        say(f"graphs: {name}")
+    """Time a call of each mode, of solvers with a fixed effort, forward and with gradients to points and pixels."""
+    for name, direction in itertools.product(amount.graphs, amount.directions):
         torch.compiler.reset()
         solvers = {mode: create_solver(name, effort="fixed").to(device, torch.float32) for mode in amount.modes}
         for mode, solver in solvers.items():
             if (options := MODES[mode]) is not None:
                 contenders.compile_or_raise(solver, **options)
         for batch in amount.calls:
-            modes = _modes(solvers, batch, device, amount.rounds)
-            yield {"solver": name, "batch": batch, "modes": modes}
+            say(f"graphs: {name}, B = {batch}, {direction}")
+            modes = _modes(solvers, batch, device, amount.rounds, direction)
+            yield {"solver": name, "batch": batch, "mode": direction, "modes": modes}
             for mode in [mode for mode, found in modes.items() if "why" in found]:
                 del solvers[mode]  # a solver that has failed to compile runs uncompiled from now on
 
 
-def _modes(solvers: Mapping[str, nn.Module], batch: int, device: str, rounds: int) -> dict[str, dict[str, Any]]:
-    """Time a call of each mode in turns, and compare its result with that of the first mode."""
+def _modes(
+    solvers: Mapping[str, nn.Module], batch: int, device: str, rounds: int, direction: str
+) -> dict[str, dict[str, Any]]:
+    """Time a call of each mode in turns, and compare its poses and gradients with those of the first mode."""
     problems = draw(N, batch)
-    inputs = contenders.float_inputs(problems, device)
     tasks: dict[str, Task] = {}
     modes: dict[str, dict[str, Any]] = {}
-    expected = None
+    expected: tuple[Tensor, ...] = ()
     for mode, solver in solvers.items():
-        say(f"graphs: B = {batch}, {mode}")
+        call = call_of(solver, problems, device, direction)
         try:
-            call: Callable[[], PnPResult] = torch.no_grad()(partial(solver, inputs[0], inputs[1], inputs[2]))
             task = _task(captured(call) if mode == "captured" else call, problems, device)
             start = time.perf_counter()
             task.warm()
-            result = task.call()
+            rotation, ok, slope = (x.clone() for x in task.call())  # the next replay overwrites its result
         except (CannotBeTimedError, RuntimeError) as error:
             modes[mode] = {"why": reason(error)}
             continue
-        warm_s = time.perf_counter() - start
+        modes[mode] = {"warm_s": time.perf_counter() - start}
         tasks[mode] = task
-        found = result.rotation.clone(), result.ok.clone()  # the next replay overwrites its result
-        expected = found if expected is None else expected
-        difference = rotation_difference(found[0], expected[0])
-        same_ok = share(found[1] == expected[1])
-        modes[mode] = {"rotation_difference": float(difference.max()), "same_ok": same_ok, "warm_s": warm_s}
+        expected = expected or (rotation, ok, slope)
+        modes[mode] |= {
+            "rotation_difference": float(rotation_difference(rotation, expected[0]).max()),
+            "same_ok": share(ok == expected[1]),
+            "same_gradient": share((slope - expected[2]).norm(dim=1) <= 1e-2 * expected[2].norm(dim=1)),
+        }
     timers = {mode: partial(_microseconds, task, 10) for mode, task in tasks.items()}
     for mode, rounds_us in in_turns(timers, rounds).items():
         modes[mode] |= summary(rounds_us)
     return modes
+
+
+def call_of(solver: nn.Module, problems: Problems, device: str, direction: str) -> Callable[[], _Found]:
+    """A call that returns rotations, ``ok``, and gradients to points and pixels, which are empty forward."""
+    world, img, intrinsics = contenders.float_inputs(problems, device)
+    if direction == FORWARD:
+
+        @torch.no_grad()
+        def forward() -> _Found:
+            result = solver(world, img, intrinsics)
+            return result.rotation, result.ok, world.new_zeros(len(world), 0)
+
+        return forward
+    leaves = [x.detach().requires_grad_() for x in (world, img)]
+
+    def with_gradients() -> _Found:
+        result = solver(*leaves, intrinsics)
+        slopes = contenders.gradient(result.pose, leaves)
+        return result.rotation.detach(), result.ok, torch.cat([x.flatten(1) for x in slopes], 1)
+
+    return with_gradients
+
+
+def waits(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
+    """Count how often a call waits for the GPU, because the next operations depend on values or copy from the CPU."""
+    problems = draw(N, 100)
+    for (name, effort), direction in itertools.product(amount.waits, (FORWARD, BACKWARD)):
+        solver = create_solver(name, effort=effort).to(device, torch.float32)
+        call = call_of(solver, problems, device, direction)
+        call()
+        places: Counter[str] = Counter()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            torch.cuda.set_sync_debug_mode("warn")
+            call()
+            torch.cuda.set_sync_debug_mode("default")
+        for warning in caught:
+            if "called a synchronizing" in str(warning.message):
+                path = Path(warning.filename)
+                places[f"{path.parent.name}/{path.name}:{warning.lineno}"] += 1
+        yield {"solver": name, "effort": effort, "mode": direction, "waits": places.total(), "places": dict(places)}
 
 
 def _microseconds(task: Task, times: int = 1) -> float:
@@ -332,7 +402,7 @@ def peak_bytes(task: Task, device: str) -> int | None:
 
 
 Part = Callable[[str, Amount], Iterator[dict[str, Any]]]
-PARTS: dict[str, Part] = {"parity": parity, "graphs": graphs, "throughput": measure_throughput}
+PARTS: dict[str, Part] = {"parity": parity, "waits": waits, "graphs": graphs, "throughput": measure_throughput}
 
 
 def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -> None:

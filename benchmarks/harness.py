@@ -27,8 +27,6 @@ from kornia_pnpnet.core.tables import markdown_table
 HERE = Path(__file__).resolve().parent
 
 Row = Mapping[str, Any]
-#: A column of a table: a format string of the row's entries, or a function of the row.
-Column = str | Callable[[Row], str]
 
 
 @contextmanager
@@ -138,9 +136,10 @@ def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
 
 
 def render(template: str, **facts: Any) -> str:
-    """A page from its template; a fact that is missing is an error."""
+    """A page from its template, with the filters ``percent`` and ``digits``; a fact that is missing is an error."""
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
+    environment.filters |= {"percent": percent, "digits": three_digits}
     return environment.get_template(template).render(**facts)
 
 
@@ -155,58 +154,30 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def fill(column: Column, row: Row) -> str:
-    """The cell of a column in a row."""
-    return column.format_map(row) if isinstance(column, str) else column(row)
-
-
-def table(rows: Iterable[Row], columns: Mapping[str, Column], **options: Any) -> str:
-    """A Markdown table with a line for each row, by the titles of its columns."""
-    return markdown_table([*columns], [[fill(x, row) for x in columns.values()] for row in rows], **options)
-
-
 def pivot(
     rows: Iterable[Row],
-    keys: Mapping[str, Column],
+    keys: Mapping[str, str],
     names: Iterable[str],
-    cell: Column,
+    cell: Callable[[Row], str],
     *,
     by: str = "solver",
     **options: Any,
 ) -> str:
     """A Markdown table with a line for each combination of the keys, and a column for each value of the entry ``by``.
 
-    The columns of ``names`` hold ``cell``; options are those of :func:`~kornia_pnpnet.core.tables.markdown_table`.
+    Keys are format strings by the titles of their columns. The columns of ``names`` hold ``cell``; options are those of
+    :func:`~kornia_pnpnet.core.tables.markdown_table`.
     """
     lines: dict[tuple[str, ...], dict[str, str]] = {}
     for row in rows:
-        lines.setdefault(tuple(fill(x, row) for x in keys.values()), {})[row[by]] = fill(cell, row)
+        lines.setdefault(tuple(x.format_map(row) for x in keys.values()), {})[row[by]] = cell(row)
     cells = [[*place, *(line.get(name, "–") for name in names)] for place, line in lines.items()]
     return markdown_table([*keys, *names], cells, **options)
 
 
-def targets_table(targets: Iterable[Row]) -> str:
-    """Every target beside the measurement."""
-
-    def wanted(row: Row) -> str:
-        return f"at {'most' if row['at_most'] else 'least'} {row['target']:g} {row['unit']}".rstrip()
-
-    columns: dict[str, Column] = {
-        **{"What": "{what}", "Wanted": wanted},
-        "Measured": lambda row: f"{three_digits(row['measured'])} {row['unit']}".rstrip(),
-        "Verdict": lambda row: "met" if row["met"] else "**missed**",
-    }
-    return table(targets, columns)
-
-
-def percent(key: str, digits: int = 1, unit: str = "") -> Column:
-    """A column of shares in per cent."""
-    return lambda row: "–" if row[key] is None else f"{100 * row[key]:.{digits}f}{unit}"
-
-
-def digits(key: str, unit: float = 1.0) -> Column:
-    """A column of numbers in a unit, with three digits."""
-    return lambda row: three_digits(row[key] / unit)
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share in per cent, without the sign."""
+    return "–" if value is None else f"{100 * value:.{digits}f}"
 
 
 def three_digits(value: float) -> str:

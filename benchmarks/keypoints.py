@@ -20,12 +20,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import parser, recorded, table, threads
+from harness import parser, recorded, threads
 from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 
 from kornia_pnpnet import create_solver, pose_errors
 from kornia_pnpnet.core.files import read_npz
+from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import Pose
 
@@ -144,10 +145,14 @@ def main() -> None:
     with threads():
         settings = {"right": RIGHT, "cap": CAP, "samples": SAMPLES, "dtype": "float64"}
         made = recorded(lambda: {"results": [measure(path) for path in options.problems]}, **settings)
-    columns = {"way": "{way}", **{key: f"{{{key}:.3f}}" for key in ("error", "capped", "median", "right", "ok")}}
+    columns = ("error", "capped", "median", "right", "ok")
     for one in made["results"]:
         print({key: value for key, value in one.items() if key != "rows"})
-        print(table(one["rows"], columns))
+        print(
+            markdown_table(
+                ["way", *columns], [[row["way"], *(f"{row[x]:.3f}" for x in columns)] for row in one["rows"]]
+            )
+        )
     save_results({**made, "sources": sources}, options.out)
 
 

@@ -12,7 +12,7 @@ import harness
 import numpy as np
 import pandas as pd
 from contenders import ANY, COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS, PLAIN, TRAINED, N
-from harness import HERE, Column, Row, digits, percent, pivot, table, targets_table, three_digits
+from harness import HERE, Row
 from timing import BACKWARD, FORWARD
 
 from kornia_pnpnet import PnPNet
@@ -27,13 +27,6 @@ PAGE = HERE.parent / "docs" / "performance.md"
 PARTS = ("throughput", "latency", "startup")
 #: Caches of the compiler at a start, or no compiler.
 COLD, CACHED, EAGER = "cold", "cached", "eager"
-#: Who calls a solver in which way, and how the names of such contenders end.
-WAYS = (
-    ("a notebook, or batches of any size", "`solver(...)`: eager", ""),
-    ("one solver in a loop for minutes", "`solver.compile()`", " compiled"),
-    ("one problem at a time: a robot, a service, C++", "`pnpnet export x.pt2`: packaged", " packaged"),
-    ("no PyTorch on the machine", "`pnpnet export x.onnx`", " ONNX"),
-)
 #: Contenders that the pictures also show.
 DRAWN = ("p3p-ransac", "kornia-dlt")
 #: Other libraries.
@@ -47,11 +40,6 @@ def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
     return {row["contender"]: row for row in rows if wanted.items() <= row.items()}
 
 
-def time_of(rows: Rows, name: str, unit: float = 1.0) -> str:
-    """The median time of a contender in ``unit`` microseconds, or a dash."""
-    return three_digits(rows[name]["median_us"] / unit) if name in rows else "–"
-
-
 def successes(row: Row) -> str:
     """Success in per cent with its interval."""
     return str(SuccessRate(**row["success"])).replace(" %", "")
@@ -62,199 +50,75 @@ def is_whole(name: str) -> bool:
     return name.partition(" ")[0] in (TRAINED, ANY)
 
 
-class Summary:
-    """The first tables and sentences of the page, from the results files by their names in ``PARTS``."""
-
-    def __init__(self, results: Rows) -> None:
-        self.batch = results["throughput"]["settings"]["problems"]
-        self.starts = results["startup"]["starts"]
-        # One thread, without gradients: single problems, and batches of problems of N pairs.
-        self.alone = matching(results["latency"]["rows"], threads=1)
-        self.many = matching(results["throughput"]["rows"], threads=1, mode=FORWARD, n=N, batch=self.batch)
-
-    def first_call(self, name: str, cache: str | None = None) -> float | None:
-        """Seconds to make a solver and call it once: uncompiled, or with this cache (default: cold)."""
-        wanted = cache or (COLD if "compiled" in name else EAGER)
-        found = matching(self.starts, contender=name, backward=False, cache=wanted).get(name)
-        return None if found is None else float(found["make_s"] + found["calls"][0]["first_s"])
-
-    def ways(self) -> str:
-        """When to call a solver in which way, and what that costs; in each cell ``TRAINED`` and ``ANY``."""
-
-        def both(text: Any) -> Column:
-            return lambda way: " · ".join(text(solver + way["end"]) for solver in (TRAINED, ANY))
-
-        columns: dict[str, Column] = {
-            **{"You have": "{who}", "Use": "{call}"},
-            "one problem (ms)": both(lambda name: time_of(self.alone, name, 1e3)),
-            f"each of {self.batch} (µs)": both(lambda name: time_of(self.many, name)),
-            "first call (s)": both(lambda name: three_digits(first) if (first := self.first_call(name)) else "–"),
-        }
-        rows = [{"who": who, "call": call, "end": end} for who, call, end in WAYS]
-        return table(rows, columns, align="llrrr")
-
-    def compiling_pays(self) -> list[str]:
-        """For each solver, its speedup by compiling, and the number of problems that pay for the compiler."""
-        found = []
-        for name in (TRAINED, ANY):
-            compiled = f"{name} compiled"
-            seconds = self.first_call(compiled)
-            if seconds is None or not all(key in rows for key in (name, compiled) for rows in (self.alone, self.many)):
-                continue
-            parts = []
-            for rows, what in ((self.many, f"in batches of {self.batch}"), (self.alone, "one at a time")):
-                slow, fast = rows[name]["median_us"], rows[compiled]["median_us"]
-                count = 1e6 * seconds / (slow - fast) if fast < slow else 0.0
-                step = 10 ** max(0, len(f"{count:.0f}") - 2)  # two digits
-                pays = f"pays after {round(count / step) * step:,} problems" if count else "never pays"
-                parts.append(f"{slow / fast:.1f} times as fast {what} ({pays})")
-            found.append(f"`{name}` compiled is {' and '.join(parts)}.")
-        return found
-
-    def libraries(self) -> str:
-        """Whole solvers of ours and of other libraries: one problem at a time, and batches."""
-        names = [*filter(is_whole, self.alone), *(peer for peer in PEERS if peer in self.alone)]
-        columns: dict[str, Column] = {
-            "Solver": "`{contender}`",
-            "one problem (ms)": digits("median_us", 1e3),
-            f"each of {self.batch} (µs)": lambda row: time_of(self.many, row["contender"]),
-            "success, one problem (%)": successes,
-        }
-        return table((self.alone[name] for name in names), columns)
-
-    def leaders(self) -> list[str]:
-        """For one problem and for batches, the fastest of ours and of the other libraries."""
-        found = []
-        for what, rows in (("One problem at a time", self.alone), ("Batches", self.many)):
-            sides = [*filter(is_whole, rows)], [name for name in PEERS if name in rows]
-            if all(sides):
-                best = (min(side, key=lambda name: rows[name]["median_us"]) for side in sides)
-                fast, slow = sorted(best, key=lambda name: rows[name]["median_us"])
-                times = rows[slow]["median_us"] / rows[fast]["median_us"]
-                found.append(f"{what}: `{fast}` is fastest, {times:.1f} times as fast as `{slow}`.")
-        return found
+def compiling_pays(alone: Rows, many: Rows, batch: int, first_calls: Mapping[tuple[str, str], float]) -> list[str]:
+    """For each solver, its speedup by compiling, and the number of problems that pay for the compiler."""
+    found = []
+    for name in (TRAINED, ANY):
+        compiled = f"{name} compiled"
+        seconds = first_calls.get((compiled, COLD))
+        if seconds is None or not all(key in rows for key in (name, compiled) for rows in (alone, many)):
+            continue
+        parts = []
+        for rows, what in ((many, f"in batches of {batch}"), (alone, "one at a time")):
+            slow, fast = rows[name]["median_us"], rows[compiled]["median_us"]
+            count = 1e6 * seconds / (slow - fast) if fast < slow else 0.0
+            step = 10 ** max(0, len(f"{count:.0f}") - 2)  # two digits
+            pays = f"pays after {round(count / step) * step:,} problems" if count else "never pays"
+            parts.append(f"{slow / fast:.1f} times as fast {what} ({pays})")
+        found.append(f"`{name}` compiled is {' and '.join(parts)}.")
+    return found
 
 
-def medians(rows: Iterable[Row], unit: float = 1.0, **wanted: Any) -> Column:
-    """A column of the median times of some rows, by the contender of a line."""
-    found = matching(rows, **wanted)
-    return lambda row: time_of(found, row["contender"], unit)
+def leaders(alone: Rows, many: Rows) -> list[str]:
+    """For one problem and for batches, the fastest of ours and of the other libraries."""
+    found = []
+    for what, rows in (("One problem at a time", alone), ("Batches", many)):
+        sides = [*filter(is_whole, rows)], [name for name in PEERS if name in rows]
+        if all(sides):
+            best = (min(side, key=lambda name: rows[name]["median_us"]) for side in sides)
+            fast, slow = sorted(best, key=lambda name: rows[name]["median_us"])
+            times = rows[slow]["median_us"] / rows[fast]["median_us"]
+            found.append(f"{what}: `{fast}` is fastest, {times:.1f} times as fast as `{slow}`.")
+    return found
 
 
-def throughput_table(results: Row, batch: int) -> str:
-    """One batch size on one thread and two, forward and with gradients."""
-    rows = [row for row in results["rows"] if (row["n"], row["batch"]) == (N, batch)]
-    columns: dict[str, Column] = {
-        "Contender": "`{contender}`",
-        "forward, one thread": medians(rows, threads=1, mode=FORWARD),
-        "two": medians(rows, threads=2, mode=FORWARD),
-        "forward+backward, one": medians(rows, threads=1, mode=BACKWARD),
-        "two threads": medians(rows, threads=2, mode=BACKWARD),
-        "success (%)": successes,
-    }
-    firsts: dict[str, Row] = {}
-    for row in rows:
-        firsts.setdefault(row["contender"], row)  # forward, on one thread
-    return table(firsts.values(), columns)
-
-
-def latency_table(results: Row) -> str:
-    """The distributions on one thread, and the median on two."""
-    named = {"median (ms)": "median_us", "90 %": "p90_us", "99 %": "p99_us", "largest": "max_us"}
-    columns: dict[str, Column] = {
-        "Contender": "`{contender}`",
-        **{title: digits(key, 1e3) for title, key in named.items()},
-        "99 % by median": lambda row: f"{row['p99_us'] / row['median_us']:.2f}",
-        "median, two threads": medians(results["rows"], 1e3, threads=2),
-        "success (%)": successes,
-    }
-    return table(matching(results["rows"], threads=1).values(), columns)
-
-
-def startup_table(results: Row) -> str:
-    """Cold starts, a line for each contender, mode and cache."""
-
-    def name(entry: Row) -> str:
-        kinds = [BACKWARD] * entry["backward"] + [entry["cache"]] * (entry["cache"] != EAGER)
-        return ", ".join([f"`{entry['contender']}`", *kinds])
-
-    def later(entry: Row) -> str:
-        others = entry["calls"][1:]
-        return three_digits(sum(call["first_s"] for call in others)) if others else "–"
-
-    columns: dict[str, Column] = {
-        "Contender": name,
-        "import (s)": lambda entry: three_digits(entry["torch_s"] + entry["package_s"]),
-        "first call (s)": lambda entry: three_digits(entry["make_s"] + entry["calls"][0]["first_s"]),
-        "second call (ms)": lambda entry: three_digits(1e3 * entry["calls"][0]["second_s"]),
-        "next batch sizes (s)": later,
-    }
-    # An eager start with gradients is like one without.
-    return table((x for x in results["starts"] if not x["backward"] or x["cache"] != EAGER), columns)
-
-
-def memory_table(results: Row) -> str:
-    """How much calls add to the peak of a process."""
-    modes = {False: "forward (MiB)", True: "forward+backward (MiB)"}
-    rows = [{**entry, "mode": modes[entry["backward"]]} for entry in results["starts"] if entry["memory"]]
-
-    def added(entry: Row) -> str:
-        return three_digits((entry["memory"]["peak_bytes"] - entry["memory"]["before_bytes"]) / 2**20)
-
-    return pivot(rows, {"Contender": "`{contender}`"}, modes.values(), added, by="mode")
+def memory(starts: Iterable[Row]) -> dict[str, dict[bool, float]]:
+    """How many MiB calls add to the peak of a process, by contender, without and with gradients."""
+    found: dict[str, dict[bool, float]] = {}
+    for entry in starts:
+        if entry["memory"]:
+            added = entry["memory"]["peak_bytes"] - entry["memory"]["before_bytes"]
+            found.setdefault(entry["contender"], {})[entry["backward"]] = added / 2**20
+    return found
 
 
 def gpu_section(results: Row | None) -> dict[str, Any] | None:
-    """Tables and facts of the section on a GPU, from the file of ``gpu.py``."""
+    """Facts of the section on a GPU, from the file of ``gpu.py``."""
     if results is None:
         return None
-    parity, part = results["parity"], results["throughput"]
+    part = results["throughput"]
     rows = [row for row in part["rows"] if "median_us" in row]
     loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
-    sizes = {f"B = {batch}": batch for batch in part["settings"]["batches"]}
     groups: dict[tuple[str, int, str], dict[int, Row]] = {}
     for row in rows:
         if "work" in row:
             groups.setdefault((row["contender"], row["n"], row["mode"]), {})[row["batch"]] = row
-    lines, quickest = [], {}
-    for (name, n, mode), found in groups.items():
+    lines = {}
+    for place, found in groups.items():
         best = min(found.values(), key=lambda row: row["median_us"])
-        faster = f"{loops[n]['median_us'] / best['median_us']:.0f}"
-        us = {batch: three_digits(row["median_us"]) for batch, row in found.items()}
-        times = {title: us.get(batch, "–") for title, batch in sizes.items()}
-        lines.append({**best, **best["shares"], **times, "faster": faster})
-        if (n, mode) == (N, FORWARD):
-            quickest[name] = us[best["batch"]], faster
-    columns: dict[str, Column] = {
-        **{"Contender": "`{contender}`", "mode": "{mode}", "n": "{n}", **{title: f"{{{title}}}" for title in sizes}},
-        "times as fast as PoseLib": "{faster}",
-        "memory (KiB a problem)": lambda row: three_digits(row["peak_bytes"] / row["batch"] / 1024),
-        **{"floor (%)": percent("floor"), "traffic (%)": percent("traffic")},
-    }
-    calls = [
-        {**row, **found, "mode": mode}
-        for row in results["graphs"]["rows"]
-        for mode, found in row["modes"].items()
-        if "median_us" in found
-    ]
-    graphs: dict[str, Column] = {"Solver": "`{solver}`", "mode": "{mode}", "problems": "{batch}"}
-    compared: dict[str, Column] = {
-        **{"Solver": "`{solver}`", "dtype": "{dtype}", "success, CPU (%)": percent("cpu"), "GPU (%)": percent("gpu")},
-        **{f"same {key} (%)": percent(f"same_{key}") for key in ("ok", "pose", "gradient")},
-    }
-    complete = [
-        {**row, **dict(zip(("cpu", "gpu"), row["success"], strict=True))}
-        for row in parity["rows"]
-        if None not in (row.get("same_pose"), row.get("same_gradient"))
-    ]
+        faster = f"{loops[best['n']]['median_us'] / best['median_us']:.0f}"
+        lines[place] = {**best, "us": {batch: row["median_us"] for batch, row in found.items()}, "faster": faster}
+    complete = [x for x in results["parity"]["rows"] if None not in (x.get("same_pose"), x.get("same_gradient"))]
     return {
         "made": part["environment"],
-        "poselib": {"us": loops[N]["median_us"], "n": N},
-        "count": parity["settings"]["parity"],
-        "best": [(name, *quickest[name]) for name in (TRAINED, ANY)],
-        "throughput": table(lines, columns),
-        "graphs": table(calls, {**graphs, "a call (ms)": digits("median_us", 1e3)}),
-        "parity": table(complete, compared),
+        "poselib_us": loops[N]["median_us"],
+        "count": results["parity"]["settings"]["parity"],
+        "batches": part["settings"]["batches"],
+        "throughput": lines.values(),
+        "graphs": results["graphs"]["rows"],
+        "modes": results["graphs"]["settings"]["modes"],
+        "waits": results["waits"]["rows"],
+        "parity": complete,
     }
 
 
@@ -271,29 +135,34 @@ def skipped_reasons(results: Rows) -> list[str]:
 
 def page(results: Rows, gpu: Row | None = None) -> str:
     """The page as Markdown, from the results files by their names in ``PARTS`` and the one of ``gpu.py``."""
-    settings, shipped, summary = results["throughput"]["settings"], PnPNet.from_pretrained(TRAINED), Summary(results)
-    targets = [entry for part in PARTS for entry in results[part]["targets"]]
-    sizes = [entry["calls"][1:] for entry in results["startup"]["starts"] if len(entry["calls"]) > 1]
+    throughput, latency, starts = results["throughput"], results["latency"]["rows"], results["startup"]["starts"]
+    settings, shipped = throughput["settings"], PnPNet.from_pretrained(TRAINED)
+    sizes = [entry["calls"][1:] for entry in starts if len(entry["calls"]) > 1]
+    first_calls = {
+        (x["contender"], x["cache"]): x["make_s"] + x["calls"][0]["first_s"] for x in starts if not x["backward"]
+    }
+
+    def at(threads: int, mode: str) -> Rows:
+        return matching(throughput["rows"], threads=threads, mode=mode, n=N, batch=settings["problems"])
+
+    alone, many = matching(latency, threads=1), at(1, FORWARD)
     return harness.render(
         "performance.md.jinja",
         **{"trained": TRAINED, "plain": PLAIN, "any": ANY, "n": N, "m": ITERATIONS},
-        **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT},
+        **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT, "successes": successes, "at": at},
+        **{"cold": COLD, "cached": CACHED, "eager": EAGER, "forward": FORWARD, "backward": BACKWARD},
         shipped={"m": shipped.refine.m, "views": shipped.views},
-        made=results["throughput"]["environment"],
+        made=throughput["environment"],
         results=results,
         settings=settings,
-        ways=summary.ways(),
-        cached=[(name, summary.first_call(f"{name} compiled", CACHED)) for name in (TRAINED, ANY)],
-        pays=summary.compiling_pays(),
-        libraries=summary.libraries(),
-        leaders=summary.leaders(),
-        met=(sum(entry["met"] for entry in targets), len(targets)),
-        targets=targets_table(targets),
-        throughput=throughput_table(results["throughput"], summary.batch),
-        latency=latency_table(results["latency"]),
+        **{"alone": alone, "two": matching(latency, threads=2), "many": many},
+        first_calls=first_calls,
+        pays=compiling_pays(alone, many, settings["problems"], first_calls),
+        libraries=[*filter(is_whole, alone), *(peer for peer in PEERS if peer in alone)],
+        leaders=leaders(alone, many),
+        targets=[entry for part in PARTS for entry in results[part]["targets"]],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
-        startup=startup_table(results["startup"]),
-        memory=memory_table(results["startup"]),
+        memory=memory(starts),
         gpu=gpu_section(gpu),
         skipped=skipped_reasons(results),
     )

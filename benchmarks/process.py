@@ -18,16 +18,9 @@ _WARM = (64, 65)
 
 
 def main(request: dict[str, Any]) -> dict[str, Any]:
-    """Measure one contender.
+    """Measure one contender: imports, making it, two calls of each of the ``batches``, and memory.
 
-    Args:
-        request: ``contender``; ``backward``; ``batches``, batch sizes that are called twice each, in this order;
-            ``memory_batch``, the batch size of the memory measurement, 0 for none.
-
-    Returns:
-        ``contender``, ``backward``; ``torch_s``, ``package_s`` (without PyTorch), ``make_s``; ``calls``, for each batch
-        size ``first_s`` and ``second_s``; ``memory``: ``before_bytes`` and ``peak_bytes`` of the process around the
-        call, or ``None``; ``warnings`` of the calls.
+    ``memory_batch`` is the batch size of the memory measurement, 0 for none.
     """
     clock = [time.perf_counter()]
     import torch  # noqa: F401

@@ -49,7 +49,7 @@ from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.plots import BLUE, GREY, ORANGE, WIDTH, make_figure, save
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.metrics import reliability
-from kornia_pnpnet.peers.base import PeerSolver
+from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.result import PnPResult, Pose, Problems
 
 Floats = NDArray[np.float64]
@@ -219,13 +219,12 @@ def triangulate(views: Sequence[View]) -> list[Floats]:
     poses, cameras = [pycolmap.Rigid3d(view.pose) for view in views], []
     for view in views:
         (fx, _, cx), (_, fy, cy), _ = view.intrinsics
-        size = {"width": view.size[0], "height": view.size[1]}
-        cameras.append(pycolmap.Camera(model="PINHOLE", **size, params=[fx, fy, cx, cy]))
+        width, height = view.size
+        cameras.append(pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, cx, cy]))
     found = [np.full((len(view.pixels), 3), np.nan) for view in views]
     for track in tracks(views):
         pixels = np.array([views[i].pixels[at] for i, at in track])
-        seen_by = [i for i, _ in track]
-        chosen = [poses[i] for i in seen_by], [cameras[i] for i in seen_by]
+        chosen = [poses[i] for i, _ in track], [cameras[i] for i, _ in track]
         made = pycolmap.estimate_triangulation(pixels, chosen[0], chosen[1], options)
         if made is not None and all(made["inliers"]):
             for i, at in track:
@@ -271,10 +270,10 @@ def make(folder: Path, out: Path, *, features: int, every: int, views: int, pair
                 at = generator.permutation(at)[:pairs]
                 error = np.linalg.norm(query.project(world[at]) - query.pixels[at], axis=1)
                 error[np.isnan(error)] = np.inf
-                values = (world[at], query.pixels[at], ratio[at], np.ones(len(at), dtype=bool), error)
-                pose = (query.intrinsics, query.pose[:, :3], query.pose[:, 3], kind)
-                names = {"query": query.name, "database": database[number].name}
-                rows.append({**dict(zip((*OF_PAIRS, *OF_PROBLEMS), (*values, *pose), strict=True)), **names})
+                row = {"world": world[at], "pixels": query.pixels[at], "ratio": ratio[at], "error_px": error}
+                row |= {"mask": np.ones(len(at), dtype=bool), "kind": kind, "K": query.intrinsics}
+                row |= {"R": query.pose[:, :3], "t": query.pose[:, 3]}
+                rows.append(row | {"query": query.name, "database": database[number].name})
     if not rows:
         raise ValueError(f"{folder} has no problems.")
     arrays: dict[str, Any] = {name: np.stack([row[name] for row in rows]) for name in rows[0] if name not in OF_PAIRS}

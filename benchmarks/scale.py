@@ -57,16 +57,10 @@ def draw(folder: Path, problems: int) -> None:
 
 
 def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dict[str, Any]:
-    """Run a command with one thread in each process.
+    """Run a command with one thread in each process; times and memory of all its processes together.
 
-    Args:
-        command: the command.
-        kill_at: a folder, a number of problems and a title. Once the folder has results of that number of problems, the
-            first process whose title contains the text is killed; with an empty text all processes of the command.
-
-    Returns:
-        ``wall_s``; ``cpu_s`` and ``peak_bytes`` of all processes together; ``killed_at``, the number of problems with
-        results when processes were killed, or ``None``; the ``load`` of the machine at the end.
+    ``kill_at``: a folder, a number of problems and a title. Once the folder has results of that number of problems, the
+    first process whose title contains the text is killed; with an empty text all processes of the command.
     """
     say(" ".join(command[-8:]))
     start = time.perf_counter()
@@ -95,13 +89,8 @@ def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dic
         raise RuntimeError("the command ended before a process could be killed")
     if process.returncode and not (kill_at and not kill_at[2]):
         raise RuntimeError(f"{' '.join(command)} failed")
-    return {
-        "wall_s": wall,
-        "cpu_s": sum(cpu.values()),
-        "peak_bytes": peak,
-        "killed_at": killed,
-        "load": os.getloadavg()[0],
-    }
+    spent = {"wall_s": wall, "cpu_s": sum(cpu.values()), "peak_bytes": peak}
+    return {**spent, "killed_at": killed, "load": os.getloadavg()[0]}
 
 
 def rows(folder: Path) -> int:

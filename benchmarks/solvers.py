@@ -134,33 +134,33 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
     return {"skipped": skipped, "rows": rows, "speedups": speedups(rows), "memory": memory}
 
 
-def format_tables(results: harness.Row) -> str:
-    """Times with success, and the targets, as two Markdown tables."""
+def targets(results: harness.Row) -> list[dict[str, Any]]:
+    """The targets of speed and of memory beside the measurements."""
+    found = [
+        harness.target(
+            "`{solver}` beside `{peer}`, {set}".format_map(x),
+            x["ratio"],
+            x["target"],
+            unit="times as fast",
+            at_most=False,
+        )
+        for x in results["speedups"]
+    ]
+    for entry in results["memory"]:
+        peak, rise, wanted = (entry[f"{key}_bytes"] / 2**30 for key in ("peak", "rise", "target"))
+        what = "Memory of `{solver}`, {count} problems, {set}".format_map(entry)
+        found.append(harness.target(f"{what} ({rise:.2f} GiB without the imports)", peak, wanted, unit="GiB"))
+    return found
+
+
+def page(results: harness.Row) -> str:
+    """The tables as a page."""
 
     def cell(row: harness.Row) -> str:
         return f"{row['median_us']:.1f} µs (min {row['min_us']:.1f}), {100 * row['success']['rate']:.1f} %"
 
     times = harness.pivot(results["rows"], {"Solver": "`{solver}`"}, SETS, cell, by="set", align="l" * (1 + len(SETS)))
-    targets = [
-        harness.target(
-            "`{solver}` beside `{peer}`, {set}".format_map(entry),
-            entry["ratio"],
-            entry["target"],
-            unit="times as fast",
-            at_most=False,
-        )
-        for entry in results["speedups"]
-    ]
-    for entry in results["memory"]:
-        peak, rise, wanted = (entry[f"{key}_bytes"] / 2**30 for key in ("peak", "rise", "target"))
-        what = "Memory of `{solver}`, {count} problems, {set}".format_map(entry)
-        targets.append(harness.target(f"{what} ({rise:.2f} GiB without the imports)", peak, wanted, unit="GiB"))
-    return f"{times}\n\n{harness.targets_table(targets)}"
-
-
-def page(results: harness.Row) -> str:
-    """The tables as a page."""
-    return harness.render("solvers.md.jinja", results=results, tables=format_tables(results))
+    return harness.render("solvers.md.jinja", results=results, times=times, targets=targets(results))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -188,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         command.error(str(error))
     if options.out:
         harness.write(options.out, results, page)
-    print(format_tables(results))
+    print(page(results))
 
 
 if __name__ == "__main__":

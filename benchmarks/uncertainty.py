@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 import harness
 import numpy as np
 import torch
-from harness import Column, percent, share
+from harness import share
 from kornia.geometry.liegroup import So3
 from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
@@ -237,18 +237,16 @@ def measure_priors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     for n, outliers in FEW:
         problems, generator = draw(n, outliers, count, 2), torch.Generator().manual_seed(SEED)
         priors: dict[str, PosePrior | None] = {"nothing": None}
-        for (name, make), wrong in itertools.product(
-            {"gravity": gravity, "last pose": last_pose}.items(), (0.0, WRONG)
-        ):
+        makers = {"gravity": gravity, "last pose": last_pose}
+        for (name, make), wrong in itertools.product(makers.items(), (0.0, WRONG)):
             priors[f"{name}, wrong" if wrong else name] = make(problems, generator, wrong)
         row: dict[str, Any] = {"n": n, "outliers": outliers}
         for name, prior in priors.items():
             row[name] = success_share(solver(*problems[:3], **sigmas, prior=prior), problems)
             if "wrong" not in name:
                 known: dict[str, Any] = {**sigmas, "prior": prior, "init": problems.pose}
-                row[f"{name}, bound"] = success_share(
-                    bound(*problems[:3], problems.inliers.double(), **known), problems
-                )
+                best = bound(*problems[:3], problems.inliers.double(), **known)
+                row[f"{name}, bound"] = success_share(best, problems)
         rows.append(row)
     return rows
 
@@ -332,31 +330,9 @@ def targets(results: harness.Row) -> list[dict[str, Any]]:
 
 def page(results: harness.Row) -> str:
     """The page of the results."""
-
-    def both(name: str) -> Column:
-        return lambda row: " ".join(f"{x:.3g}" if x > 10 else f"{x:.3f}" for x in row[name])
-
-    def shares(rows: Sequence[harness.Row], columns: dict[str, Column], *keys: str) -> str:
-        """A table with the columns, and one for each entry that is not among the keys."""
-        return harness.table(rows, columns | {key: percent(key, unit=" %") for key in rows[0] if key not in keys})
-
-    errors: dict[str, Column] = {"Pixels": "{pixels}", "n": "{n}", "Outliers": percent("outliers", 0, " %")}
-    errors |= {name: both(name) for name in ("covariances", "sigmas", "nothing", *PEERS)}
-    times = {"n": "{n}", **{name: f"{{{name}[median_us]:.1f}}" for name in ("sigmas", "covariances")}}
-    size: dict[str, Column] = {"n": "{n}", "Outliers": "{outliers}"}
-    credible = {"Noise": "{noise}", **size, "Mean": "{mean:.2f}", "Below the limit": percent("below", unit=" %")}
-    planar: dict[str, Column] = {"Tilt": "{tilt:.0f}°", "Noise": "{sigma:.1f} px"}
-    return harness.render(
-        "uncertainty.md.jinja",
-        results=results,
-        **{"batch": BATCH, "gravity": GRAVITY, "turn": TURN, "shift": SHIFT, "wrong": WRONG},
-        targets=harness.targets_table(results["targets"]),
-        errors=harness.table(results["rows"], errors),
-        times=harness.table(results["times"], {**times, "Ratio": "{ratio:.2f}"}, align="rrrr"),
-        covariances=harness.table(results["covariances"], {**credible, "Problems used": percent("used", unit=" %")}),
-        priors=shares(results["priors"], size, "n", "outliers"),
-        planar=shares(results["squares"], planar, "tilt", "sigma"),
-    )
+    answers = ("covariances", "sigmas", "nothing", *PEERS)
+    facts = {"batch": BATCH, "gravity": GRAVITY, "turn": TURN, "shift": SHIFT, "wrong": WRONG}
+    return harness.render("uncertainty.md.jinja", results=results, targets=results["targets"], answers=answers, **facts)
 
 
 def main() -> None:

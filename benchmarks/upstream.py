@@ -27,7 +27,7 @@ from typing import Any
 
 import torch
 from contenders import random_cameras, relative_errors
-from harness import HERE, Row, parser, pivot, recorded, render, say, table, threads
+from harness import HERE, Row, parser, pivot, recorded, render, say, threads
 from kornia.geometry import solve_pnp_dlt
 from torch import Tensor
 
@@ -151,9 +151,7 @@ def page(results: Row) -> str:
     names = list(dict.fromkeys(x["solver"] for x in results["success"]))
     title = {name: name if " " in name and "=" not in name else f"`{name}`" for name in names}
     success = [{**x, "title": title[x["solver"]]} for x in results["success"]]
-    outliers = {"outliers": "{share:.0%}"}
-    batches = {"batch": "{batch}", "`solve_pnp_robust`": "{us:,.0f}", "OpenCV RANSAC": "{opencv_us:,.0f}"}
-    descent = {**outliers, "solver": "`{solver}`", "first step": "{first:.1e}", "last step": "{last:.1e}"}
+    keys = {"pairs": "{n}", "outliers": "{share:.0%}"}
 
     def solved(row: Row) -> str:
         return f"{100 * row['success']:.1f} ({row['us']:,.0f})"
@@ -162,9 +160,7 @@ def page(results: Row) -> str:
         "upstream.md.jinja",
         results=results,
         steps=STEPS,
-        success=pivot(success, {"pairs": "{n}", **outliers}, [*title.values()], solved, by="title"),
-        batches=table(results["batches"], batches),
-        descent=table(results["descent"], descent, align="llrr"),
+        success=pivot(success, keys, [*title.values()], solved, by="title"),
     )
 
 

@@ -5,64 +5,41 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeVar
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kornia_pnpnet.cameras import bearing_cameras, check_coefficients, focal_length, pinholes, undistort
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_shapes, common_dtype, expand_sigma
-from kornia_pnpnet.core.linalg import nearest_rotation
-from kornia_pnpnet.core.performance import in_full_precision, present_first, sees_values
+from kornia_pnpnet.core.checks import (
+    Shapes,
+    check_devices,
+    check_form,
+    check_shapes,
+    check_tensors,
+    common_dtype,
+    expand_sigma,
+)
+from kornia_pnpnet.core.performance import full_precision, present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
-from kornia_pnpnet.core.trees import map_tensors, take
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import MIN_PAIRS, Noise
 from kornia_pnpnet.refine.terms import CameraTerm
-from kornia_pnpnet.result import PnPResult, Pose, PosePrior, camera_matrices
+from kornia_pnpnet.result import PnPResult, Pose, PosePrior, camera_matrices, with_rotation
 
-__all__ = [
-    "Inputs",
-    "Part",
-    "checked_inputs",
-    "checked_noise",
-    "given_cameras",
-    "joined",
-    "one_batch",
-    "restore_leading",
-    "split_batch",
-    "with_undistorted",
-]
+__all__ = ["Inputs", "checked_inputs", "given_cameras", "joined", "restore_leading", "split_batch", "with_undistorted"]
 
 _T = TypeVar("_T")
 
 # Pairs. `_without_padding` keeps at least this number of pairs of each problem, padding included.
 _LEAST_PAIRS = 16
-#: Keys: names of tensors in error messages. Values: whether the tensor has an entry for each pair (else one for each
-#: problem), and the shape of an entry. :func:`checked_inputs` has the shapes of the other tensors.
-_ENTRIES: dict[str, tuple[bool, tuple[int, ...]]] = {
-    "weights": (True, ()),
-    "mask": (True, ()),
-    "confidence": (True, ()),
-    "img_cov": (True, (2, 2)),
-    "world_cov": (True, (3, 3)),
-    "init rotation": (False, (3, 3)),
-    "init translation": (False, (3,)),
-    "prior rotation": (False, (3, 3)),
-    "prior translation": (False, (3,)),
-    "prior information": (False, (6, 6)),
-    "prior scale": (False, ()),
-    "cam_from_rig rotation": (True, (3, 3)),
-    "cam_from_rig translation": (True, (3,)),
-}
 
 
 class Inputs(NamedTuple):
     """The arguments of a call as one batch in one dtype. If ``noise`` is given, every pair has sigmas.
 
-    In a rig, ``intrinsics`` has a camera matrix for each pair, (B, N, 3, 3), and ``rig`` has the transform from the rig
-    to the camera of each pair. When a solver estimates the focal length, ``free_focal`` is the range and the prior of
-    the focal length in the caller's pixels. If ``radial`` is given, the pixels are already undistorted with these
-    estimated coefficients.
+    In a rig, ``intrinsics`` has a camera matrix for each pair, (B, N, 3, 3), and ``rig`` the transform from the rig to
+    the camera of each pair. ``free_focal`` is the range and the prior of an unknown focal length in the caller's
+    pixels. The pixels are already undistorted with the estimated coefficients ``radial``, if given.
     """
 
     world_points: Tensor
@@ -80,21 +57,19 @@ class Inputs(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Some problems of a batch, and their positions in the batch.
+    """Some problems of a batch.
 
     Attributes:
         inputs: the problems.
-        problems: positions of the problems in the batch, (P,). ``None``: the parts are consecutive slices of the batch.
-        pairs: for each problem, the positions of its pairs in the batch's pair dimension, (P, n). ``None``: all pairs.
-        most_pairs: size of the batch's pair dimension; 0 without ``pairs``.
+        places: positions of the problems in the batch, (P,), and for each problem the order of the batch's pairs,
+            (P, N), of which ``inputs`` has the first. ``None``: the parts are consecutive slices of the batch.
     """
 
     inputs: Inputs
-    problems: Tensor | None = None
-    pairs: Tensor | None = None
-    most_pairs: int = 0
+    places: tuple[Tensor, Tensor] | None = None
 
 
+@full_precision
 def checked_inputs(
     world_points: Tensor,
     img_points: Tensor,
@@ -112,15 +87,13 @@ def checked_inputs(
     dist: Tensor | None = None,
     fisheye: Tensor | None = None,
     cam_from_rig: Pose | None = None,
+    init_name: str = "init",
 ) -> tuple[torch.Size, Inputs]:
-    """Check the arguments of a call, and convert them to one batch of one dtype (``core.checks.common_dtype``).
+    """Check the arguments of ``PnPNet.forward``, and return the leading dimensions and one batch of one dtype.
 
-    For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Distorted pixels
-    become pixels of pinhole cameras. Bearings become a rig: each pair gets a camera whose optical axis is the pair's
-    bearing. Tensor values are not checked, because reading a value would stall a GPU.
-
-    Returns:
-        The leading dimensions of ``world_points``, and the inputs with one batch dimension.
+    Distorted pixels become pixels of pinhole cameras. Bearings become a rig: each pair gets a camera whose optical axis
+    is the pair's bearing. Tensor values are not checked, because reading a value would stall a GPU. ``init_name`` names
+    ``init`` in messages.
     """
     is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
     if intrinsics is None and is_bearing:
@@ -130,19 +103,29 @@ def checked_inputs(
             "intrinsics must be a tensor, got NoneType: only bearings (B, N, 3) may omit it, pixels (B, N, 2) need it."
         )
     matrices = camera_matrices(intrinsics)
-    tensors: dict[str, Any] = {"world_points": world_points, "img_points": img_points, "intrinsics": matrices}
-    optional: dict[str, Any] = {"weights": weights, "mask": mask, "confidence": confidence}
-    optional |= {"img_cov": img_cov, "world_cov": world_cov, "dist": dist, "fisheye": fisheye}
-    for name, pose in (("init", init), ("prior", prior and prior.pose), ("cam_from_rig", cam_from_rig)):
-        rotation, translation = (None, None) if pose is None else pose
-        optional |= {f"{name} rotation": rotation, f"{name} translation": translation}
+    if prior is not None and not isinstance(prior, PosePrior):
+        raise TypeCheckError(f"prior must be a PosePrior, got {type(prior).__name__}.")
+    # Tensors with an entry for each pair or for each problem, and the shape of an entry.
+    of_pairs: Shapes = {"weights": (weights, ()), "mask": (mask, ()), "confidence": (confidence, ())}
+    of_pairs |= {"img_cov": (img_cov, (2, 2)), "world_cov": (world_cov, (3, 3))}
+    of_problems: Shapes = {}
     if prior is not None:
-        optional |= {"prior information": prior.information, "prior scale": prior.scale}
+        of_problems |= {"prior information": (prior.information, (6, 6)), "prior scale": (prior.scale, ())}
+    poses = (init_name, init, of_problems), ("prior", prior and prior.pose, of_problems)
+    for name, pose, entries in (*poses, ("cam_from_rig", cam_from_rig, of_pairs)):
+        if pose is not None:
+            if not (isinstance(pose, tuple) and len(pose) == 2):
+                raise TypeCheckError(f"{name} must be a Pose, got {type(pose).__name__}.")
+            rotation, translation = pose
+            entries |= {f"{name} rotation": (rotation, (3, 3)), f"{name} translation": (translation, (3,))}
+    optional: dict[str, Any] = {name: x for name, (x, _) in (of_pairs | of_problems).items()}
+    for name, sigma in (("img_sigma", img_sigma), ("world_sigma", world_sigma)):
+        optional[name] = sigma if isinstance(sigma, Tensor) else None
+    optional |= {"dist": dist, "fisheye": fisheye}
+    tensors: dict[str, Any] = {"world_points": world_points, "img_points": img_points, "intrinsics": matrices}
     tensors |= {name: x for name, x in optional.items() if x is not None}
-    for name, value in tensors.items():
-        if not isinstance(value, Tensor):
-            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
-    KORNIA_CHECK_SHAPE(world_points, ["*", "N", "3"])
+    check_tensors(tensors)
+    check_form(["*", "N", "3"], world_points=world_points)
     size, count = world_points.shape[:-2], world_points.shape[-2]
     tensors["intrinsics"] = matrices = _of_problems(intrinsics, matrices, size)
     if weights is not None and weights.shape == (*size, count, 2):
@@ -162,8 +145,8 @@ def checked_inputs(
         "img_points": (img_points, (*size, count, 3 if is_bearing else 2)),
         "intrinsics": (matrices, (*of_camera, 3, 3)),
     }
-    for name, (each_pair, entry) in _ENTRIES.items():
-        shapes[name] = tensors.get(name), (*size, *((count,) if each_pair else ()), *entry)
+    shapes |= {name: (x, (*size, count, *entry)) for name, (x, entry) in of_pairs.items()}
+    shapes |= {name: (x, (*size, *entry)) for name, (x, entry) in of_problems.items()}
     for name, lens in (("dist", dist), ("fisheye", fisheye)):
         if lens is not None:
             shapes[name] = lens, (*(size if lens.ndim > 1 else ()), lens.shape[-1])
@@ -173,46 +156,35 @@ def checked_inputs(
     if mask is not None and mask.dtype != torch.bool:
         raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
     check_devices(tensors, world_points)
-    sigmas = {"img_sigma": img_sigma, "world_sigma": world_sigma}
-    numbers = {**tensors, **{name: x for name, x in sigmas.items() if isinstance(x, Tensor)}}
-    dtype = common_dtype({name: x for name, x in numbers.items() if name != "mask"})
-    noise = checked_noise(world_points.to(dtype), img_sigma, world_sigma, img_cov, world_cov)
+    dtype = common_dtype({name: x for name, x in tensors.items() if name != "mask"})
+    noise = _checked_noise(world_points.to(dtype), img_sigma, world_sigma, img_cov, world_cov)
     per_pair = matrices if matrices.ndim == 2 or of_pair else matrices[..., None, :, :]
     cameras = per_pair.expand(*size, count, 3, 3) if is_rig else matrices.expand(*size, 3, 3)
     init, rig = (None if pose is None else Pose(*pose) for pose in (init, cam_from_rig))
     inputs = Inputs(world_points, img_points, cameras, weights, mask, init, noise, confidence, prior, rig)
     inputs = map_tensors(lambda x: one_batch(x, size, dtype), inputs)
-    if inputs.init is not None:
-        inputs = inputs._replace(init=_with_rotation(inputs.init))
-    if inputs.prior is not None:
-        inputs = inputs._replace(prior=inputs.prior._replace(pose=_with_rotation(inputs.prior.pose)))
-    dist, fisheye = (
-        None if x is None else one_batch(x.expand(*size, x.shape[-1]), size, dtype) for x in (dist, fisheye)
+    init, prior, rig = inputs.init, inputs.prior, inputs.rig
+    inputs = inputs._replace(
+        init=init and with_rotation(init),
+        prior=prior and prior._replace(pose=with_rotation(prior.pose)),
+        rig=rig and with_rotation(rig),
     )
     if is_bearing:
         return size, _looking_along(inputs)
-    return size, inputs if dist is None and fisheye is None else with_undistorted(inputs, dist, fisheye)
+    if dist is None and fisheye is None:
+        return size, inputs
+    lenses = map_tensors(lambda x: one_batch(x.expand(*size, x.shape[-1]), size, dtype), (dist, fisheye))
+    return size, with_undistorted(inputs, *lenses)
 
 
-def _with_rotation(pose: Pose) -> Pose:
-    """Replace each matrix by the nearest rotation, or by NaN if its determinant is not positive."""
-    with in_full_precision(pose.rotation.device.type):
-        rotation, unique = nearest_rotation(pose.rotation.permute(1, 2, 0))
-        usable = unique & (torch.linalg.det(pose.rotation.detach()) > 0)
-    return Pose(torch.where(usable[:, None, None], rotation.permute(2, 0, 1), torch.nan), pose.translation)
-
-
-def checked_noise(
+def _checked_noise(
     world_points: Tensor,
     img_sigma: Tensor | float | None,
     world_sigma: Tensor | float | None,
     img_cov: Tensor | None,
     world_cov: Tensor | None,
 ) -> Noise | None:
-    """The noise of every pair in the dtype of ``world_points``; ``None`` if the caller gave no sigma and no covariance.
-
-    For the arguments and errors see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
-    """
+    """The noise of every pair in the dtype of ``world_points``; ``None`` if the caller gave no noise."""
     kinds = {"img": (img_sigma, img_cov), "world": (world_sigma, world_cov)}
     for name, (sigma, cov) in kinds.items():
         if sigma is not None and cov is not None:
@@ -234,6 +206,8 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 
     Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay: ``Normalize`` refuses their problem.
     """
+    # Rounding of the lens depends on the memory layout.
+    inputs, dist, fisheye = map_tensors(torch.Tensor.contiguous, (inputs, dist, fisheye))
     broken = ~inputs.img_points.isfinite().all(-1)
     seen = torch.where(broken[..., None], 0.0, inputs.img_points)
     pixels, found, noise = undistort(seen, inputs.intrinsics, dist, fisheye, inputs.noise)
@@ -244,14 +218,19 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 def _looking_along(inputs: Inputs) -> Inputs:
     """Convert bearings to a rig, see :func:`checked_inputs`."""
     rotation, sound = bearing_cameras(inputs.img_points)
+    rig = inputs.rig
+    if rig is not None:  # a pair with an invalid camera becomes a pair without a direction
+        sound = sound & torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach().isfinite().all(-1)
+        eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+        turn = torch.where(sound[..., None, None], rig.rotation, eye)
+        shift = torch.where(sound[..., None], rig.translation, 0.0)
+        rig = Pose(rotation @ turn, (rotation @ shift[..., None])[..., 0])
     axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
     # The geometric mean of fx and fy converts sigmas from pixels to radians. Skew and principal point are ignored.
     cameras, has_focal = pinholes(inputs.intrinsics.diagonal(dim1=-2, dim2=-1).diag_embed())
     focal = torch.where(has_focal, focal_length(cameras), 0.0)
     cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
-    rig = Pose(rotation, torch.zeros_like(rotation[..., 0]))
-    if inputs.rig is not None:
-        rig = Pose(rotation @ inputs.rig.rotation, (rotation @ inputs.rig.translation[..., None])[..., 0])
+    rig = Pose(rotation, torch.zeros_like(rotation[..., 0])) if rig is None else rig
     return inputs._replace(img_points=axis, intrinsics=cameras, rig=rig)
 
 
@@ -285,12 +264,9 @@ def _of_problems(intrinsics: Tensor | PinholeCamera, matrices: Tensor, size: tor
 def split_batch(inputs: Inputs, most: int | None, any_number: bool) -> list[Part]:
     """On a CPU, split a batch into parts that fit the caches and are solved one after the other.
 
-    Args:
-        inputs: the batch.
-        most: a part has at most this number of pairs times the number of CPU threads. ``None`` or recorded gradients:
-            no limit.
-        any_number: whether problems may be grouped by their number of pairs, so that parts have little padding.
-            Grouping saves a third to half of the time if the numbers of pairs differ strongly.
+    A part has at most ``most`` pairs for each CPU thread; no limit with ``None`` or recorded gradients. With
+    ``any_number``, problems are grouped by their number of pairs, so that parts have little padding. Grouping saves a
+    third to half of the time if the numbers of pairs differ strongly.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:
@@ -311,39 +287,32 @@ def _without_padding(inputs: Inputs, most: int) -> list[Part]:
     counts = inputs.mask.sum(1)
     if batch * count <= most and int(counts.max()) == count:
         return [Part(inputs)]
-    order = present_first(inputs.mask)
-    sizes, problems = counts.sort(stable=True)
+    order, (sizes, problems) = present_first(inputs.mask), counts.sort(stable=True)
+    of_problem = {"init", "prior"} if inputs.rig is not None else {"init", "prior", "intrinsics"}
     parts, stop = [], batch
     while stop:
         width = min(count, max(int(sizes[stop - 1]), _LEAST_PAIRS))
         start = max(stop - max(most // width, 2), 0)
         start = 0 if start == 1 else start
-        at = problems[start:stop]
-        pairs = order[at, :width]
-        of_problem: dict[str, Any] = {"init": inputs.init, "prior": inputs.prior}
-        if inputs.rig is None:
-            of_problem["intrinsics"] = inputs.intrinsics
-        nothing: dict[str, Any] = dict.fromkeys(of_problem)
-        without = inputs._replace(**nothing)
-        some = map_tensors(lambda x, at=at, pairs=pairs: x[at[:, None], pairs], without)
-        some = some._replace(**{name: take(tree, at) for name, tree in of_problem.items()})
-        parts.append(Part(some, at, pairs, count))
+        at, pairs = problems[start:stop], order[problems[start:stop]]
+        entries: dict[str, Any] = {}
+        for name, tree in inputs._asdict().items():
+            index = (at,) if name in of_problem else (at[:, None], pairs[:, :width])
+            entries[name] = map_tensors(lambda x, index=index: x[index], tree)
+        parts.append(Part(Inputs(**entries), (at, pairs)))
         stop = start
     return parts
 
 
 def joined(parts: list[Part], results: list[PnPResult]) -> PnPResult:
     """Join the results of the parts of a batch."""
-    padded = []
-    for part, result in zip(parts, results, strict=True):
-        if part.pairs is not None:
-            none = result.weights.new_zeros(len(part.pairs), part.most_pairs)
-            weights = none.scatter(1, part.pairs, result.weights)
-            result = result._replace(weights=weights, inliers=(none > 0).scatter(1, part.pairs, result.inliers))
-        padded.append(result)
-    result = padded[0] if len(padded) == 1 else map_tensors(lambda *x: torch.cat(x), *padded)
-    if parts[0].problems is None:
-        return result
-    problems = torch.cat([part.problems for part in parts if part.problems is not None])
-    back = torch.empty_like(problems).scatter_(0, problems, torch.arange(len(problems), device=problems.device))
-    return map_tensors(lambda x: x[back], result)
+    places = [part.places for part in parts if part.places is not None]
+    for i, (_, pairs) in enumerate(places):
+        none, at, result = torch.zeros_like(pairs), pairs[:, : results[i].weights.shape[1]], results[i]
+        weights = none.to(result.weights).scatter(1, at, result.weights)
+        results[i] = result._replace(weights=weights, inliers=none.bool().scatter(1, at, result.inliers))
+    whole = results[0] if len(results) == 1 else map_tensors(lambda *x: torch.cat(x), *results)
+    if not places:
+        return whole
+    back = torch.cat([problems for problems, _ in places]).argsort()
+    return map_tensors(lambda x: x[back], whole)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from torch import Tensor, nn
 
+from kornia_pnpnet.core.checks import check_form
 from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.registry import create_solver
 from kornia_pnpnet.result import Status
@@ -32,7 +32,6 @@ INPUTS = tuple(_SHAPES)
 #: Columns that :class:`Solve` writes.
 OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
-# Tests of Arrow types. Each list type passes one test of `_LISTS`, each number type one test of `_NUMBERS`.
 _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
 _NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
 # Names of the values of `Status`, and last the status of rows that were not solved.
@@ -44,21 +43,16 @@ _PADDED_FROM = 16
 class Solve:
     r"""Map a table of problems to a table of poses, for example in ``map_batches`` of Ray Data.
 
-    Each row is a problem. The number of pairs N may differ between rows. Each cell is a list of numbers in row-major
-    order. The columns are
+    Each row is a problem; the number of pairs N may differ between rows. Each cell is a list of numbers in row-major
+    order: ``world_points`` (3N numbers), ``img_points`` in pixels (2N), and optionally ``intrinsics`` (9), ``weights``
+    (N), ``img_sigma`` in pixels and ``world_sigma`` in the unit of the world (N or one number; NaN: unknown).
 
-    - ``world_points`` (3N numbers) and ``img_points`` in pixels (2N numbers),
-    - optional ``intrinsics`` (9 numbers) and ``weights`` (N numbers),
-    - optional ``img_sigma`` in pixels and ``world_sigma`` in the unit of the world (N numbers or one number; NaN:
-      unknown).
+    The result has the columns ``rotation`` (9), ``translation`` (3), ``weights`` (N), ``cost``, ``ok`` and ``status``,
+    the name of a :class:`~kornia_pnpnet.result.Status` in lower case. Rows keep their order, and other columns of the
+    table, for example ``id``, are kept. Numbers are float32.
 
-    The result has the columns ``rotation`` (9 numbers), ``translation`` (3 numbers), ``weights`` (N numbers), ``cost``,
-    ``ok`` and ``status``. A ``status`` is the name of a :class:`~kornia_pnpnet.result.Status` in lower case, or
-    ``malformed``. Other columns of the table, for example ``id``, are kept. Rows keep their order. Numbers are float32.
-
-    A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. A row is ``malformed`` if
-    a list is missing or has an incorrect length, or if the solver does not accept the number of pairs. Other rows
-    change the result of a row by rounding errors only.
+    A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. Its status is
+    ``malformed`` if a list is missing or has an incorrect length, or if the solver does not accept the number of pairs.
 
     Args:
         solver: a name of :func:`~kornia_pnpnet.registry.list_solvers`, or a solver.
@@ -78,25 +72,20 @@ class Solve:
         ([7, 8], [True, True])
     """
 
-    #: Pairs. A call of the solver gets at most about this number of pairs (padding included), to limit the memory.
+    #: Pairs, padding included. A call of the solver gets at most about this number, to limit the memory.
     pairs_at_once = 2**17
 
     def __init__(
         self, solver: str | nn.Module = "pnpnet-set", *, intrinsics: Tensor | None = None, **options: Any
     ) -> None:
         if intrinsics is not None:
-            KORNIA_CHECK_SHAPE(intrinsics, ["3", "3"])
+            check_form(["3", "3"], intrinsics=intrinsics)
             intrinsics = intrinsics.float()
         self.solver = create_solver(solver, **options) if isinstance(solver, str) else solver
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve the problems of a table.
-
-        Raises:
-            ValueCheckError: when a required column is missing.
-            TypeCheckError: when a column does not hold numbers.
-        """
+        """Solve a table; ``ValueCheckError`` for a missing column, ``TypeCheckError`` for one without numbers."""
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"no {name}")
@@ -121,11 +110,11 @@ class Solve:
                 for name, array in values.items():
                     array[rows] = getattr(result, name).numpy()
                 weights[(ends[rows, None] + np.arange(width))[there]] = result.weights.numpy()[there]
-        lists = {name: list_column(values[name]) for name in OUTPUTS[:2]}
-        lists["weights"] = pa.ListArray.from_arrays(pa.array(ends, pa.int32()), weights)
-        status = _STATUS_NAMES.take(pa.array(values["status"]))
-        results = {**lists, "cost": pa.array(values["cost"]), "ok": pa.array(values["ok"]), "status": status}
-        return pa.table({name: table[name] for name in table.column_names if name not in INPUTS + OUTPUTS} | results)
+        columns = {name: table[name] for name in table.column_names if name not in INPUTS + OUTPUTS}
+        columns |= {name: list_column(values[name]) for name in ("rotation", "translation")}
+        columns["weights"] = pa.ListArray.from_arrays(pa.array(ends, pa.int32()), weights)
+        columns |= {name: pa.array(values[name]) for name in ("cost", "ok")}
+        return pa.table({**columns, "status": _STATUS_NAMES.take(pa.array(values["status"]))})
 
 
 def list_column(values: np.ndarray) -> pa.Array:
@@ -140,10 +129,7 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """A column of lists of numbers. The list of row i is ``values[starts[i] : starts[i] + sizes[i]]``.
-
-    A missing number is NaN. A missing list has the size 0.
-    """
+    """A column of lists ``values[starts[i] : starts[i] + sizes[i]]``. Missing numbers are NaN, missing lists empty."""
 
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
         array = column.combine_chunks()
@@ -173,8 +159,7 @@ class _Cells:
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
     """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
 
-    Rows with fewer than 16 pairs are not padded. Other rows are padded to the next number of the series 16, 20, 24, 28,
-    32, 40, 48, ..., which adds at most a quarter. The padding of a row does not depend on the other rows.
+    The numbers are those below 16, and 16, 20, 24, 28, 32, 40, 48, ..., which add at most a quarter.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

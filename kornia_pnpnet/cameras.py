@@ -1,22 +1,27 @@
-"""Convert distorted pixels to pixels of pinhole cameras or to bearings, and find a camera for each bearing."""
+"""Undistorted pixels and bearings of distorted pixels, cameras that look along bearings, and reprojections."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import ShapeError, ValueCheckError
 from kornia.geometry.calibration import distort_points
-from kornia.geometry.conversions import convert_points_to_homogeneous, normalize_points_with_intrinsics
+from kornia.geometry.conversions import (
+    convert_points_from_homogeneous,
+    convert_points_to_homogeneous,
+    normalize_points_with_intrinsics,
+)
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from kornia_pnpnet.core.checks import check_devices, check_shapes, common_dtype
+from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, check_tensors, common_dtype
+from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.problem import Noise
+from kornia_pnpnet.result import Pose
 
-__all__ = ["bearing_cameras", "bearings", "check_coefficients", "focal_length", "pinholes", "undistort"]
+__all__ = ["bearing_cameras", "bearings", "check_coefficients", "focal_length", "pinholes", "reproject", "undistort"]
 
 # Numbers of distortion coefficients that Kornia and OpenCV accept.
 _COEFFICIENTS = (4, 5, 8, 12, 14)
@@ -34,9 +39,8 @@ def undistort(
     r"""Replace pixels of a camera with distortion by pixels of the pinhole camera with the same intrinsics.
 
     Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse.
-    Kornia's :func:`kornia.geometry.calibration.undistort_points` is not used, because its fixed-point iteration does
-    not test convergence. Kornia's error is 1.4 px for a pixel 45 degrees off the axis with ``k1 = -0.2`` and a focal
-    length of 320 px. Kornia also accepts pixels outside the range of the distortion polynomial.
+    Kornia's :func:`kornia.geometry.calibration.undistort_points` does not test convergence, and accepts pixels outside
+    the range of the polynomial. Its error is 1.4 px at 45 degrees off the axis with ``k1 = -0.2`` and ``f = 320``.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.
@@ -47,12 +51,11 @@ def undistort(
 
     Returns:
         The undistorted pixels; whether each pixel could be undistorted, bool :math:`(B, N)`; and the noise of the
-        undistorted pixels. A pixel cannot be undistorted if it is outside the range of the polynomial, if it is more
-        than 85 degrees off the axis of a fisheye, or if the pixel, the coefficients or the camera are invalid. The
-        principal point then replaces the pixel. The standard deviation of isotropic noise is multiplied by the root
-        mean square of the singular values of the undistortion's Jacobian, so that the noise stays isotropic.
+        undistorted pixels. A pixel outside the range of the polynomial or more than 85 degrees off the axis of a
+        fisheye, and an invalid pixel, camera or coefficient, give the principal point. Isotropic noise is multiplied by
+        the root mean square of the singular values of the undistortion's Jacobian, so that it stays isotropic.
     """
-    KORNIA_CHECK_SHAPE(img_points, ["B", "N", "2"])
+    check_form(["B", "N", "2"], img_points=img_points)
     camera, _ = pinholes(intrinsics)
     point, found, lens = _through(dist, fisheye, img_points, intrinsics)
     flatten = (lambda x: x) if fisheye is None else _flatten
@@ -62,18 +65,22 @@ def undistort(
     pixels = transform_points(camera, flatten(point))
     if noise is not None:
         with torch.no_grad():  # derivative of the undistorted with respect to the distorted point
-            jacobian = _jacobian(flatten, point) @ _inverse(_jacobian(lens, point))
+            jacobian = _linearised(flatten, point)[1] @ _inverse(_linearised(lens, point)[1])
             eye = torch.eye(2, dtype=jacobian.dtype, device=jacobian.device)
             jacobian = torch.where(found[..., None, None], jacobian, eye)
         to_pixels = camera[:, None, :2, :2]
-        jacobian = to_pixels @ jacobian @ torch.linalg.inv(to_pixels)
-        noise = noise._replace(img=noise.img * (0.5 * jacobian.square().sum((-1, -2))).sqrt())
+        # Only the upper triangle is read. A matrix that has other entries is no camera, and can be singular.
+        jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
+        # An unknown sigma (NaN) is replaced first, so that the gradient of the camera is not NaN.
+        unknown, factor = noise.img.isnan(), (0.5 * jacobian.square().sum((-1, -2))).sqrt()
+        noise = noise._replace(img=torch.where(unknown, torch.nan, torch.where(unknown, 0.0, noise.img) * factor))
         if noise.img_cov is not None:
             (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
             noise = noise._replace(img_cov=noise.img_cov.mapped(a, b, d, c))
     return pixels, found, noise
 
 
+@full_precision
 def bearings(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None = None, fisheye: Tensor | None = None
 ) -> Tensor:
@@ -102,8 +109,10 @@ def bearings(
         >>> bearings(behind, camera, fisheye=torch.zeros(4))
         tensor([[[ 0.7071,  0.0000, -0.7071]]])
     """
+    check_tensors({"dist": dist, "fisheye": fisheye})
     check_coefficients(dist, fisheye)
-    KORNIA_CHECK_SHAPE(img_points, ["*", "N", "2"])
+    check_form(["*", "N", "2"], img_points=img_points)
+    check_form(["*", "3", "3"], intrinsics=intrinsics)
     size, tensors = img_points.shape[:-2], {"intrinsics": intrinsics, "dist": dist, "fisheye": fisheye}
     given = {name: x for name, x in tensors.items() if x is not None}
     entries = {name: (3, 3) if name == "intrinsics" else (x.shape[-1],) for name, x in given.items()}
@@ -117,10 +126,9 @@ def bearings(
     if fisheye is None:
         rays = normalize(convert_points_to_homogeneous(point), dim=-1)
     else:
-        angle, is_central = _angle(point)
+        angle = _angle(point)
         found = found & (angle.detach()[..., 0] < torch.pi)
-        sine, cosine = torch.where(is_central, 1.0, angle.sin() / angle), torch.where(is_central, 1.0, angle.cos())
-        rays = torch.cat((sine * point, cosine), -1)
+        rays = torch.cat((torch.sinc(angle / torch.pi) * point, angle.cos()), -1)
     return torch.where(found[..., None], rays, torch.nan).reshape(*img_points.shape[:-1], 3)
 
 
@@ -138,25 +146,21 @@ def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
 
 
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
-    r"""For each direction, find a rotation that maps the direction to the z axis (the optical axis).
+    r"""Rotations (B, N, 3, 3) that map directions (B, N, 3) to the z axis, and which directions are valid, bool (B, N).
 
-    Args:
-        rays: directions of any length but 0, shape :math:`(B, N, 3)`.
-
-    Returns:
-        Rotations :math:`(B, N, 3, 3)`, and which directions are valid (finite and not 0), bool :math:`(B, N)`. An
-        invalid direction gets a constant rotation.
+    An invalid direction, which is not finite or 0, gets a constant rotation.
 
     Example:
         >>> rotation, _ = bearing_cameras(torch.tensor([[[3.0, 0.0, -4.0]]]))
         >>> (rotation @ torch.tensor([3.0, 0.0, -4.0]))[..., 2]
         tensor([[5.]])
     """
-    KORNIA_CHECK_SHAPE(rays, ["*", "3"])
-    length = rays.detach().norm(dim=-1, keepdim=True)
-    sound = (length > 0) & length.isfinite()
+    check_form(["*", "3"], rays=rays)
+    common_dtype({"rays": rays})
+    largest = rays.detach().abs().amax(-1, keepdim=True)  # squares of other units could overflow or underflow
+    sound = (largest > 0) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
-    rays = normalize(torch.where(sound, rays, axis), dim=-1)
+    rays = normalize(torch.where(sound, rays, axis) / torch.where(sound, largest, 1.0), dim=-1)
     behind = torch.tensor([1.0, -1.0, -1.0], dtype=rays.dtype, device=rays.device)  # a half turn about x
     turn = torch.where(rays.detach()[..., 2:] < 0, behind, 1.0)
     middle = turn * rays + axis
@@ -166,13 +170,18 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (*, 3, 3) to a last entry of 1, and tell which matrices are valid, bool (*).
+    """Scale camera matrices (*, 3, 3) to a last entry of 1, and tell which are valid, bool (*).
 
-    A valid matrix has finite entries, and focal lengths that are not 0. An invalid matrix becomes the identity, without
-    gradient.
+    A valid matrix has focal lengths that are not 0. The fourth powers of its entries and of the inverses of its focal
+    lengths are finite, and the squares of its last entry and of the inverse. An invalid matrix becomes the identity,
+    without gradient.
     """
-    scaled = intrinsics.detach() / intrinsics.detach()[..., 2:, 2:]
-    sound = scaled.isfinite().all(-1).all(-1) & (scaled.diagonal(dim1=-2, dim2=-1) != 0).all(-1)
+    last, limit = intrinsics.detach()[..., 2:, 2:], torch.finfo(intrinsics.dtype).max ** 0.25
+    scaled = intrinsics.detach() / last
+    sound = (scaled.abs() < limit).flatten(-2).all(-1)
+    sound = sound & (scaled.diagonal(dim1=-2, dim2=-1).abs() > 1.0 / limit).all(-1)
+    last = last.abs()[..., 0, 0]
+    sound = sound & (last < limit**2) & (last > limit**-2)
     eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
     safe = torch.where(sound[..., None, None], intrinsics, eye)
     return safe / safe[..., 2:, 2:], sound
@@ -181,6 +190,14 @@ def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
 def focal_length(camera: Tensor) -> Tensor:
     """Geometric mean of the absolute values of fx and fy of valid camera matrices (*, 3, 3), shape (*)."""
     return (camera[..., 0, 0] * camera[..., 1, 1]).abs().sqrt()
+
+
+def reproject(world_points: Tensor, intrinsics: Tensor, pose: Pose) -> Tensor:
+    """Pixels (B, N, 2) of world points (B, N, 3); NaN for points that are not in front of the camera."""
+    cam_points = world_points @ pose.rotation.mT + pose.translation[:, None]
+    in_front = cam_points[..., 2:] > 0
+    pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
+    return torch.where(in_front, pixels, torch.nan)
 
 
 def _through(
@@ -201,10 +218,9 @@ def _through(
 
 
 def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor], Tensor]:
-    """Make the function that maps undistorted points (B, N, 2) to distorted points on the plane z = 1.
+    """Make the function that maps undistorted points (B, N, 2) to distorted points, both on the plane z = 1.
 
-    Without ``is_fisheye``, undistorted points also lie on the plane z = 1. With ``is_fisheye``, the length of an
-    undistorted point is its angle from the axis, because the plane z = 1 has no point at 90 degrees.
+    The length of an undistorted point of a fisheye is its angle, because the plane has no point at 90 degrees.
     """
     if coefficients is None:
         return lambda point: point
@@ -214,42 +230,38 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
 
     def distorted(point: Tensor) -> Tensor:
         square = point.square().sum(-1, keepdim=True)
-        stretch = torch.ones_like(square)
-        for power, k in enumerate(coefficients[:, None].split(1, -1), 1):
-            stretch = stretch + k * square**power
-        return stretch * point
+        return point + sum(k * square**i for i, k in enumerate(coefficients[:, None].split(1, -1), 1)) * point
 
     return distorted
 
 
-def _angle(point: Tensor) -> tuple[Tensor, Tensor]:
-    """Lengths (B, N, 1) of points, and whether each point is at the centre, bool. Central points get the length 1."""
-    square = point.square().sum(-1, keepdim=True)
-    is_central = square.detach() < torch.finfo(point.dtype).eps ** 2
-    return torch.where(is_central, 1.0, square).sqrt(), is_central
+def _angle(point: Tensor) -> Tensor:
+    """Lengths (B, N, 1) of points, at least the machine epsilon, so that derivatives at the centre are finite."""
+    return point.square().sum(-1, keepdim=True).clamp(min=torch.finfo(point.dtype).eps ** 2).sqrt()
 
 
 def _flatten(point: Tensor) -> Tensor:
     """Project undistorted points of a fisheye (see :func:`_lens`) onto the plane z = 1."""
-    angle, is_central = _angle(point)
-    return torch.where(is_central, 1.0, angle.tan() / angle) * point
+    angle = _angle(point)
+    return torch.sinc(angle / torch.pi) / angle.cos() * point
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
     """Find points (B, N, 2) that a lens maps to ``target`` (no solution: 0), and tell which targets have a solution."""
-    # The length of a Newton step is limited to half of the target's distance from the centre. Two further steps carry
-    # the gradients to the target and the coefficients. The second of these steps makes second derivatives exact.
+    # A Newton step is at most half as long as the target is far from the centre. Two further steps carry the gradients
+    # to the target and the coefficients; the second of these steps makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)
         for _ in range(_STEPS):
-            step = (_inverse(_jacobian(lens, point)) @ (target - lens(point))[..., None])[..., 0]
+            seen, jacobian = _linearised(lens, point)
+            step = (_inverse(jacobian) @ (target - seen)[..., None])[..., 0]
             point = point + (step * (longest / step.norm(dim=-1, keepdim=True).clamp(min=longest))).nan_to_num(0.0)
-        jacobian = _jacobian(lens, point)
+        seen, jacobian = _linearised(lens, point)
         limit = _LARGEST_RESIDUAL * torch.finfo(point.dtype).eps ** 0.5 * (1.0 + target.norm(dim=-1))
         # Beyond its maximum the polynomial has further solutions, where the Jacobian mirrors or rotates the image.
         ahead = (torch.linalg.det(jacobian) > 0) & (jacobian.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
-        found = ((target - lens(point)).norm(dim=-1) < limit) & ahead
+        found = ((target - seen).norm(dim=-1) < limit) & ahead
         point = torch.where(found[..., None], point, 0.0)
         inverse = torch.where(found[..., None, None], _inverse(jacobian), 0.0)
     target = torch.where(found[..., None], target, 0.0)
@@ -259,12 +271,13 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
     return point, found
 
 
-def _jacobian(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
-    """Central-difference Jacobians (B, N, 2, 2) of a function that maps each point independently."""
-    # Newton's method converges to the same solution with approximate Jacobians.
+def _linearised(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:
+    """Values (B, N, 2) and central-difference Jacobians (B, N, 2, 2) of a function of single points, in one call."""
     size = torch.finfo(point.dtype).eps ** (1 / 3)
-    step = size * torch.eye(2, dtype=point.dtype, device=point.device)
-    return torch.stack([(function(point + x) - function(point - x)) / (2.0 * size) for x in step], -1)
+    u, v = size * torch.eye(2, dtype=point.dtype, device=point.device)
+    moved = torch.cat((point, point + u, point - u, point + v, point - v), 1)
+    value, right, left, below, above = function(moved).tensor_split(5, 1)
+    return value, torch.stack((right - left, below - above), -1) / (2.0 * size)
 
 
 def _inverse(matrices: Tensor) -> Tensor:

@@ -14,13 +14,13 @@ from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.problem import State
+from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, State
 from kornia_pnpnet.refine.information import pixel_precision
-from kornia_pnpnet.refine.residual import normal_equations, project
+from kornia_pnpnet.refine.residual import normal_equations, pixel_variance, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
-from kornia_pnpnet.result import Pose, PosePrior
+from kornia_pnpnet.result import Pose, PosePrior, gate_pose
 
-__all__ = ["pose_covariance"]
+__all__ = ["pose_covariance", "shown_noise"]
 
 # Least eigenvalue of a regular information matrix with a unit diagonal. Smaller eigenvalues are rounding errors of
 # float64.
@@ -28,6 +28,8 @@ _LEAST_EIGENVALUE = 1e-13
 # Largest ratio of an estimated focal length to the focal length that the pixels show. A larger ratio is no estimate,
 # but the initial value of the solver's call.
 _FOCAL_RATIO = 1.5
+# Shares of the mean variance of a pixel that come from its own noise. The noise of its point causes the rest.
+_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
 def pose_covariance(
@@ -50,10 +52,8 @@ def pose_covariance(
     The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the derivative of pixel
     :math:`i` with respect to the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`.
     If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-    :math:`\Sigma_i` is the covariance of the pixel's residual, see
-    :func:`~kornia_pnpnet.refine.residual.pixel_covariance` and, for isotropic noise,
-    :func:`~kornia_pnpnet.refine.residual.pixel_variance`. The computation runs in float64. Gradients flow to the pose,
-    the points, the camera, the noise and the weights.
+    :math:`\Sigma_i` is the covariance of the pixel (:func:`~kornia_pnpnet.refine.residual.pixel_covariance`). The
+    computation runs in float64. Gradients flow to all arguments.
 
     A robust kernel gives most inliers a weight below 1. An M-estimate is nevertheless almost as accurate as least
     squares on the inliers (P. Huber, "Robust Statistics", 1981). Let :math:`u_i` be the weight of pair :math:`i`. The
@@ -65,8 +65,7 @@ def pose_covariance(
         img_points: pixels; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         img_sigma: see ``PnPNet.forward``; required without ``img_cov``.
-        world_sigma: see ``PnPNet.forward``. World points are exact if neither ``world_sigma`` nor ``world_cov`` is
-            given.
+        world_sigma: see ``PnPNet.forward``. World points without ``world_sigma`` and ``world_cov`` are exact.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
         weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as ``result.inliers.double()``.
@@ -105,18 +104,24 @@ def pose_covariance(
         img_cov=img_cov,
         world_cov=world_cov,
         prior=prior,
+        init_name="pose",
     )
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
     # The information matrix is well conditioned if the points have the centroid 0 and the spread 1.
     problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise)
     assert inputs.init is not None
     assert problem.noise is not None
-    pose = Pose(*inputs.init)
+    framed_pose, posed = frame.start(inputs.init)
+    pose = gate_pose(inputs.init, posed, posed)
     size_of_camera = 0 if focal == "known" else 1
-    state = State(frame.apply(pose), problem.weights.new_zeros(len(problem.weights), size_of_camera))
+    state = State(framed_pose, problem.weights.new_zeros(len(problem.weights), size_of_camera))
     projection, inlier = project(state, problem), _inlier_probability(problem.weights)
-    precision = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, problem.noise))
-    equations, determined = normal_equations(projection, problem, precision), frame.valid
+    noise = problem.noise
+    known = ((noise.img + noise.world).isfinite() | (problem.weights == 0)).all(1)
+    least = noise.img.nan_to_num(1.0).maximum(LEAST_NOISE * problem.focal)
+    noise = noise._replace(img=least, world=noise.world.nan_to_num(0.0))
+    precision = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
+    equations, determined = normal_equations(projection, problem, precision), posed & known
     if size_of_camera:
         plane, pixels = projection.plane, problem.img_points.permute(2, 1, 0) / problem.focal
         ratio = (plane * pixels).sum(0) / plane.square().sum(0)  # (N, B); NaN behind the camera
@@ -149,6 +154,44 @@ def pose_covariance(
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
     covariance = torch.where(determined, covariance, eye.masked_fill(eye > 0, torch.inf))
     return restore_leading(size, covariance.to(dtype))
+
+
+@torch.no_grad()
+def shown_noise(
+    pose: Pose, world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, weights: Tensor | None
+) -> dict[str, Tensor]:
+    """Estimate the noise of pixels and points from the residuals at a pose.
+
+    The noise of a point moves its pixel by an amount that falls with the depth. The likeliest of five ratios between
+    the noise of the points and the noise of the pixels is chosen, for residuals with a normal distribution.
+
+    Args:
+        pose: See pose_covariance.
+        world_points: See pose_covariance.
+        img_points: See pose_covariance.
+        intrinsics: See pose_covariance.
+        weights: See pose_covariance.
+
+    Returns:
+        ``img_sigma`` and ``world_sigma`` of :func:`pose_covariance`, shape :math:`(B,)` each.
+    """
+    size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose")
+    dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
+    problem, frame = Normalize(order=False)(*inputs[:5])
+    projection = project(State.of(frame.start(inputs.init)[0]), problem)
+    weights, exact = problem.weights, torch.zeros_like(problem.weights)
+    total = weights.sum(1).clamp(min=MIN_PAIRS)
+    # Variances of the pixels, if the standard deviation of the points is 1; then divided by their mean.
+    of_points = pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
+    mean = (weights * of_points).sum(1) / total
+    share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)
+    variance = share[..., None] + (1.0 - share[..., None]) * of_points / mean[:, None]  # (S, B, N)
+    variance = torch.where(weights > 0, variance, 1.0)
+    scale = (weights * projection.sq_residual / variance).sum(-1) / (2.0 * total - 6.0).clamp(min=1.0)  # (S, B)
+    best = (total * scale.log() + (weights * variance.log()).sum(-1)).nan_to_num(torch.inf).argmin(0)
+    share, scale = share[best, 0], scale.gather(0, best[None])[0]
+    img, world = (share * scale).sqrt() / problem.img_scale, ((1.0 - share) * scale / mean).sqrt() * frame.size
+    return {"img_sigma": restore_leading(size, img.to(dtype)), "world_sigma": restore_leading(size, world.to(dtype))}
 
 
 def _inlier_probability(weights: Tensor) -> Tensor:

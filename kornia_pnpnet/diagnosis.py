@@ -10,49 +10,36 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kornia_pnpnet.arguments import checked_inputs
+from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.judge.belief import believe
-from kornia_pnpnet.judge.evidence import at_pose, evidence, votes
+from kornia_pnpnet.judge.evidence import Votes, at_pose, evidence
 from kornia_pnpnet.problem import State
 from kornia_pnpnet.registry import create_solver
 from kornia_pnpnet.result import Pose
 
 __all__ = ["Diagnosis", "Trial", "diagnose"]
 
-# Two trials are equally good if their evidence per pair differs by less than this number, which is the difference
-# between noise of 1 px and noise of 1.28 px. Flipped pixels are also the pixels of a mirrored world.
+# Trials whose evidence per pair differs by less than that of 1 px and 1.28 px of noise are equally good.
 _EQUAL = 0.5
 
 
 class Trial(NamedTuple):
-    """How well the pairs agree with the best pose after one change.
+    """How well the pairs agree with the best pose after one change of the input; of a batch, the medians."""
 
-    Attributes:
-        change: the change of the input.
-        evidence: the evidence for the pose divided by the number of pairs, see :mod:`kornia_pnpnet.judge.evidence`.
-        agree: share of the pairs that are inliers.
-        sigma: standard deviation of a pixel coordinate that the inliers show, in pixels.
-        ok: whether the pose is believed; of a batch, whether most poses are.
-    """
-
-    change: str
-    evidence: float
-    agree: float
-    sigma: float
-    ok: bool
+    change: str  #: The change.
+    evidence: float  #: Evidence for the pose, see :mod:`kornia_pnpnet.judge.evidence`, divided by the number of pairs.
+    agree: float  #: Share of the pairs that are inliers.
+    sigma: float  #: Standard deviation of a pixel coordinate that the inliers show, in pixels.
+    ok: bool  #: Whether the pose is believed.
 
 
 class Diagnosis(NamedTuple):
-    """The result of :func:`diagnose`. Its ``str`` is one sentence.
+    """The result of :func:`diagnose`. Its ``str`` is one sentence."""
 
-    Attributes:
-        trials: all trials. The first trial is the input as given.
-        best: the trials that make the pairs agree, equally well; empty if no change does. If no change, or a change of
-            the pose, suffices, this trial is the only one.
-    """
-
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
+    #: The trials that make the pairs agree, equally well; only one if no change, or one of the pose, suffices.
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:
@@ -69,16 +56,16 @@ class Diagnosis(NamedTuple):
 
 
 @torch.no_grad()
+@full_precision
 def diagnose(
     world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, *, pose: Pose | None = None
 ) -> Diagnosis:
     """Try the usual mistakes in conventions, and tell which of them makes the pairs agree.
 
     The mistakes are swapped pixel coordinates, a y axis that points up, a left-handed world, an incorrect principal
-    point, an incorrect focal length, the intrinsics of a resized image, normalised coordinates in place of pixels, and
-    a camera-to-world pose. The solver ``pnpnet-set`` solves the input after each change, and the judge of all solvers
-    compares the poses. The points of a plane look the same from behind in a mirror, so that they cannot show a mirrored
-    world, swapped coordinates or a flipped axis.
+    point or focal length, the intrinsics of a resized image, normalised coordinates in place of pixels, and a
+    camera-to-world pose. The solver ``pnpnet-set`` solves the input after each change, and the judge of all solvers
+    compares the poses. Points of a plane cannot show a mirrored world, swapped coordinates or a flipped axis.
 
     Args:
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. All problems of a batch must
@@ -97,16 +84,19 @@ def diagnose(
         >>> [trial.change for trial in found.best]
         ['swap u and v', 'flip y', 'mirror the world']
     """
-    _, inputs = checked_inputs(world_points, img_points, intrinsics, init=pose)
+    _, inputs = checked_inputs(world_points, img_points, intrinsics, init=pose, init_name="pose")
     if inputs.rig is not None:
-        raise ShapeError(f"diagnose takes pixels (..., N, 2), got the shape {tuple(img_points.shape)}.")
+        raise ShapeError(f"img_points of diagnose must be pixels (..., N, 2), got the shape {tuple(img_points.shape)}.")
+    if not len(inputs.world_points):
+        raise ShapeError(f"diagnose needs at least one problem, got world_points of {tuple(world_points.shape)}.")
     given = inputs.world_points, inputs.img_points, inputs.intrinsics / inputs.intrinsics[:, 2:, 2:]
     changed = _changed(*given)
     names, batch = [*changed], tuple(torch.cat(x) for x in zip(*changed.values(), strict=True))
     if inputs.init is not None:
         names = [names[0], "invert the pose", "find another pose", *names[1:]]
     for effort in ("fixed", "adaptive"):  # the search for the last pose takes long and is mostly not needed
-        solver = create_solver("pnpnet-set", effort=effort).to(world_points.device)
+        with world_points.device:
+            solver = create_solver("pnpnet-set", effort=effort)
         pairs, poses = batch, solver(batch[0], batch[1], batch[2]).pose
         if inputs.init is not None:
             rotation, translation = inputs.init
@@ -126,9 +116,10 @@ def diagnose(
 def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[Trial, ...]:
     """Judge the poses of each trial: (T * B) problems for T names."""
     problem, frame = Normalize(order=False)(*pairs)
-    seen = at_pose(State.of(frame.apply(poses)), problem)
     unknown = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
-    found = evidence(seen, problem, votes(problem), unknown)
+    votes = Votes.of(problem, unknown)
+    seen = at_pose(State.of(frame.apply(poses)), problem, votes)
+    found = evidence(seen, problem, votes)
     ok = frame.valid & believe(seen, problem, found, unknown).ok
     sigma = found.sigma * problem.focal / frame.img_scale
     columns = found.log_ratio / problem.weights.shape[1], found.inlier.gt(0.5).to(sigma).mean(1), sigma, ok.to(sigma)

@@ -108,11 +108,9 @@ def export_program(
         rig: whether the program solves problems of rigs (several cameras with one pose).
 
     Returns:
-        A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, or of
-        :class:`ExportedCamera` if the focal length is unknown. The inputs are world points :math:`(B, N, 3)`, pixels
-        :math:`(B, N, 2)`, camera matrices :math:`(B, 3, 3)` and weights :math:`(B, N)`. Padding has the weight 0. A
-        program for rigs takes :data:`RIG_INPUTS`. Its camera matrices have the shape :math:`(B, N, 3, 3)`, and its last
-        two inputs are the parts of ``cam_from_rig``, see ``PnPNet.forward``.
+        A program that maps :data:`INPUTS`, with the shapes of ``PnPNet.forward``, to the fields of
+        :class:`ExportedResult`, or of :class:`ExportedCamera` if the focal length is unknown. Padding has the weight 0.
+        A program for rigs takes :data:`RIG_INPUTS`, with a camera matrix for each pair, :math:`(B, N, 3, 3)`.
 
     Raises:
         BaseError: when ``n`` is less than 3 or not the number that the network was built for, or when ``batch`` is less
@@ -166,11 +164,7 @@ def _reason(error: Exception) -> str:
 
 
 def check_packages(suffix: str) -> None:
-    """Check that everything is installed that an export to a file ``.onnx`` or ``.pt2`` needs.
-
-    Raises:
-        ImportError: when the extra ``onnx`` or, for ``.pt2``, a C++ compiler is not installed.
-    """
+    """Raise ``ImportError`` when the extra ``onnx`` or, for ``.pt2``, a C++ compiler is not installed."""
     if suffix == ".onnx":
         with needs("onnx", "ONNX models need more packages"):
             for name in ("onnx", "onnx_ir", "onnxscript"):
@@ -190,27 +184,21 @@ def check_packages(suffix: str) -> None:
 def export_package(
     solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
 ) -> Path:
-    """Compile a solver ahead of time with AOTInductor.
+    """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
     :func:`load_package` loads the package without tracing or compiling. C++ programs load the package with libtorch
     alone. A package runs on one thread. The loading CPU must have the instruction sets (for example AVX-512) of the
-    compiling CPU. The loading program must have the PyTorch version of the compiling program. Compiling takes minutes
-    and needs a C++ compiler and PyTorch 2.6 or later.
+    compiling CPU. The loading program must have the PyTorch version of the compiling program. Compiling takes minutes.
+    An existing file is replaced when the package is complete.
 
-    Args:
-        solver: See export_program.
-        path: the file to write, ``.pt2``. An existing file is replaced when the package is complete.
-        n: See export_program.
-        batch: See export_program. A package for ``batch=1`` and a fixed number of pairs solves one problem in a
-            fraction of the time of other packages. Load such a package with :func:`load_package`. With PyTorch's own
-            loader, a call overwrites the result of the previous call on the same thread.
-        rig: See export_program.
+    A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
+    packages. With PyTorch's own loader, a call of such a package overwrites the result of the previous call on the same
+    thread.
 
     Returns:
-        The path.
+        The path, which must end in ``.pt2``.
 
     Raises:
-        BaseError: See export_program; also when the file name does not end in ``.pt2``.
         ImportError: when no C++ compiler is installed.
     """
     path = Path(path)
@@ -302,16 +290,10 @@ def load_package(path: str | Path) -> PackagedSolver:
 def export_onnx(
     solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
 ) -> Path:
-    """Write a solver as an ONNX model in one file. ONNX Runtime runs the model without PyTorch.
+    """Write a solver as an ONNX model in one file, which ONNX Runtime runs without PyTorch, and return the path.
 
-    See :func:`export_program` for the arguments and their errors, and for the inputs and outputs of the model. An
-    existing file ``path`` is replaced when the model is complete.
-
-    Returns:
-        The path.
-
-    Raises:
-        ImportError: when the extra ``onnx`` is not installed.
+    See :func:`export_program` for the arguments, inputs, outputs and errors. ``ImportError``: the extra ``onnx`` is not
+    installed. An existing file is replaced when the model is complete.
     """
     check_packages(".onnx")
     path = Path(path)

@@ -1,8 +1,7 @@
 r"""Normalisation of problems: the transform from the caller's frame to the solver's frame, and its inverse.
 
-Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0. Pairs can be sorted by
-their pixels, as in the paper. The world can be centred and scaled, so that the solved pose is equivariant to
-translations and scalings of the world. A solved pose can be transformed back exactly.
+Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0. The world can be centred
+and scaled, so that the solved pose is equivariant to translations and scalings of the world.
 """
 
 from __future__ import annotations
@@ -44,17 +43,14 @@ class Frame(NamedTuple):
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
-        img_scale: factor of pixels: the geometric mean of the absolute factors of u and v, shape :math:`(B,)`. In a
-            rig, the factor is the mean over the pairs.
-        order: for each normalised pair, its position in the input, int64, shape :math:`(B, N)`. ``None``: the same
-            order.
-        status: ``Status.SOLVED`` for a valid problem, else the reason why the problem is invalid, int64, shape
-            :math:`(B,)`.
+        img_scale: factor of pixels: the geometric mean of the absolute factors of u and v, in a rig the mean over the
+            pairs, shape :math:`(B,)`.
+        order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
+        status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
             :math:`(B, N, 3, 3)`. The identity replaces invalid matrices.
-        ignored: the status of a valid problem that is not ``ok``, if the confidence of a pair or the initial pose was
-            invalid and ignored: ``Status.CONFIDENCE`` or ``Status.INIT``, else ``Status.SOLVED``, int64, shape
-            :math:`(B,)`. ``None``: the caller gave neither.
+        ignored: ``Status.CONFIDENCE`` or ``Status.INIT`` if the confidence of a pair or the initial pose was invalid
+            and ignored, else ``Status.SOLVED``, int64, shape :math:`(B,)`; ``None``: the caller gave neither.
     """
 
     centroid: Tensor
@@ -98,10 +94,7 @@ class Frame(NamedTuple):
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
 
     def start(self, init: Pose | None) -> tuple[Pose, Tensor]:
-        """Express the caller's pose in the frame of the problem, and tell which poses are finite, bool (B,).
-
-        ``None`` and non-finite poses become the identity.
-        """
+        """Express the caller's pose, else the identity, in this frame, and tell which poses are finite, bool (B,)."""
         eye = torch.eye(3, dtype=self.size.dtype, device=self.size.device).expand(self.size.shape[0], 3, 3)
         init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
         limit = torch.finfo(eye.dtype).max ** 0.25  # fourth powers of numbers below this limit are finite
@@ -165,7 +158,7 @@ class Normalize(Configured):
         confidence: Tensor | None = None,
         rig: Pose | None = None,
     ) -> tuple[Problem, Frame]:
-        r"""Normalise a batch.
+        r"""Normalise a batch. In memory, the batch is the last dimension of the problem.
 
         Args:
             world_points: shape :math:`(B, N, 3)`.
@@ -173,15 +166,9 @@ class Normalize(Configured):
             intrinsics: shape :math:`(B, 3, 3)`; in a rig one matrix for each pair, :math:`(B, N, 3, 3)`.
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
-            noise: standard deviations in pixels and in the unit of the world, NaN where unknown; covariances in the
-                squares of these units.
-            confidence: the caller's belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN where
-                unknown. Pairs with another confidence are left out.
-            rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
-
-        Returns:
-            The normalised problem, and the :class:`Frame` that undoes the normalisation. In memory, the batch is the
-            last dimension of the problem.
+            noise: in pixels and in the unit of the world.
+            confidence: see :class:`~kornia_pnpnet.problem.Problem`. Pairs with a value outside of [0, 1] are left out.
+            rig: see :class:`~kornia_pnpnet.problem.Problem`.
         """
         (batch, count), left_out = world_points.shape[:2], None
         if confidence is not None:
@@ -194,8 +181,8 @@ class Normalize(Configured):
         padded = weights is not None or mask is not None
         if weights is None:
             weights = world_points.new_ones(batch, count) if mask is None else mask.to(world_points.dtype)
-        else:
-            weights = weights if mask is None else torch.where(mask, weights, 0.0)
+        elif mask is not None:
+            weights = torch.where(mask, weights, 0.0)
         # From here on the batch is the last dimension. `rows` (6, N, B) holds the coordinates and the weight of each
         # pair. `camera` (9, B) holds the entries of each matrix: fx, fy = camera[:5:4] and cx, cy = camera[2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
@@ -258,10 +245,10 @@ class Normalize(Configured):
             rotation = torch.where(sound[..., None, None], rig.rotation, eye)
             rig = Pose(rotation, torch.where(sound[..., None], rig.translation, 0.0))
         status = torch.where(spread_out, Status.PRECISION.value, Status.DEGENERATE.value)
-        status = torch.where(is_precise, Status.SOLVED.value, status)
-        status = torch.where(number >= MIN_PAIRS, status, Status.CAMERA.value)  # no camera, or not the pixels' camera
+        status = status.masked_fill(is_precise, Status.SOLVED.value)
+        status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # no camera, or not the pixels' camera
         if padded:
-            status = torch.where(given.sum(0) >= MIN_PAIRS, status, Status.TOO_FEW_PAIRS.value)
+            status = status.masked_fill(given.sum(0) < MIN_PAIRS, Status.TOO_FEW_PAIRS.value)
         ignored = None
         if left_out is not None:
             ignored = torch.where(left_out.any(-1), Status.CONFIDENCE.value, Status.SOLVED.value)
@@ -325,7 +312,9 @@ class Normalize(Configured):
 
 def _is_usable(noise: Noise, given: Tensor, size: Tensor) -> Tensor:
     """Whether each sigma is NaN or a finite number of at least 0, and each covariance is semi-definite, bool (B,)."""
-    usable = [((x >= 0) | x.isnan()).all(-1) & ~x.isinf().any(-1) for x in (noise.img, noise.world)]
+    limit = torch.finfo(size.dtype).max ** 0.25
+    sigmas = noise.img, noise.world.detach() / size[:, None]
+    usable = [(((x >= 0) & (x < limit)) | x.isnan()).all(-1) for x in sigmas]
     world_cov = map_tensors(lambda x: x.detach() / size[:, None] / size[:, None], noise.world_cov)
     covariances = noise._replace(world_cov=world_cov).covariances
     return torch.stack([*usable, *((are_semi_definite(x) | ~given.mT).all(-1) for x in covariances)]).all(0)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import ValueCheckError
+from kornia.core.exceptions import TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.geometry.liegroup import So3
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from kornia_pnpnet.arguments import checked_inputs
 from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import Problem, Starts, State
@@ -27,20 +28,19 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
 
-# Degrees of freedom of the t distributions. The tails of the t distributions are heavier than the tails of the
-# likelihood, so that no importance weight is very large.
+# Degrees of freedom of the t distributions, whose heavy tails let no importance weight become very large.
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
 # Radians. Upper limit of a t distribution's rotation scale. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
-# Number of iterations and damping of the refinement that finds a mode, see `_Posterior.mode`.
+# Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth of a projection, as a share of the distance between camera and points. A smaller depth is raised to the
-# least depth, and the difference between both depths counts as a residual.
+# Least depth, as a share of the distance of the points. A smaller depth is raised; the difference is a residual.
 _LEAST_DEPTH = 0.02
 
 
+@full_precision
 def monte_carlo_pose_loss(
     truth: Pose,
     hypotheses: Pose | Sequence[Pose],
@@ -62,26 +62,21 @@ def monte_carlo_pose_loss(
     r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
 
     The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted
-    sum of the robust losses of the pairs. Residuals are measured in standard deviations. If the world points have
-    noise, the cost includes the logarithm of the variance, which then depends on the pose. :math:`Z` is an integral
-    over all poses, estimated by importance sampling. Early in a training no pose fits the correspondences, and
-    distances between poses have no useful gradients. The likelihood compares the true pose with all other poses, and
-    has a useful gradient from the first step.
+    sum of the robust losses of the residuals in standard deviations. If the world points have noise, the variance
+    depends on the pose, and the cost includes its logarithm. :math:`Z` is an integral over all poses, estimated by
+    importance sampling. Early in a training no pose fits the correspondences, and distances between poses have no
+    useful gradients. The likelihood compares the true pose with all others, and has one from the first step.
 
-    The same number of samples is drawn from each component of a mixture. The components are the prior, one t
-    distribution around the true pose, one around each hypothesis, and ``rounds`` further t distributions. Each further
-    t distribution is centred at a mode of the density. The sample with the largest importance weight so far is refined
-    to this mode. The precision of a t distribution is the matrix of the normal equations at its centre. In the prior
-    :math:`p_0`, rotations are uniform. Translations have a t distribution around the true translation. The scale of
-    this distribution is half the distance between camera and points. The prior has little effect once the
-    correspondences determine the pose.
+    The same number of samples is drawn from each component of a mixture: the prior, a t distribution around the true
+    pose, one around each hypothesis, and ``rounds`` further ones, each around the mode to which the sample with the
+    largest importance weight so far is refined. The precision of a t distribution is the matrix of the normal equations
+    at its centre. In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the
+    true translation, whose scale is half the distance between camera and points.
 
-    Gradients flow to points, pixels, cameras, weights, sigmas and covariances, but not to poses. A problem that a
-    solver would refuse (NaN, points on a line, no pinhole camera) has the loss 0 without gradient.
+    Gradients flow to all inputs but poses. A problem that a solver would refuse has the loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
-    4 to 7. Unlike the paper, this function uses several hypotheses and a prior, and refines samples to modes instead of
-    fitting proposals.
+    4 to 7; here with hypotheses and a prior, and with modes in place of fitted proposals.
 
     Args:
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -91,10 +86,8 @@ def monte_carlo_pose_loss(
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
         mask: see ``PnPNet.forward``.
-        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network that predicts ``img_sigma`` can be
-            trained with this loss.
-        world_sigma: see ``PnPNet.forward``. World points are exact if neither ``world_sigma`` nor ``world_cov`` is
-            given.
+        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network can learn to predict it.
+        world_sigma: see ``PnPNet.forward``. World points are exact without ``world_sigma`` and ``world_cov``.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
         samples: number of poses drawn per problem, rounded down to a multiple of the number of components.
@@ -118,6 +111,8 @@ def monte_carlo_pose_loss(
         >>> loss.shape, bool(pixels.grad.isfinite().all()), bool((pixels.grad != 0).any())
         (torch.Size([2]), True, True)
     """
+    if not isinstance(hypotheses, Sequence):
+        raise TypeCheckError(f"hypotheses must be a Pose or a sequence of poses, got {type(hypotheses).__name__}.")
     others = [hypotheses] if isinstance(hypotheses, Pose) else list(hypotheses)
     count = len(others) + 2 + rounds
     check_whole(0, rounds=rounds)
@@ -134,30 +129,28 @@ def monte_carlo_pose_loss(
             world_sigma=world_sigma if noisy_points else 0.0,
             img_cov=img_cov,
             world_cov=world_cov,
+            init_name=name,
         )
-        for pose in (truth, *others)
+        for name, pose in (("truth", truth), *(("hypotheses", pose) for pose in others))
     ]
-    size, inputs = checked[0]
+    # One pose in float64 is enough for float64.
+    size, inputs = max(checked, key=lambda x: x[1].world_points.dtype.itemsize)
     noise = inputs.noise
     assert noise is not None
     known = (noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()).all(1)
     img, world = (torch.where(known[:, None], x, 1.0) for x in noise[:2])
     with torch.no_grad():  # a gradient of the frame would only add noise to the integral's gradient
         _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
+        started = [frame.start(map_tensors(lambda y: y.to(frame.size), x.init)) for _, x in checked]
+        live = torch.stack([known, *(usable for _, usable in started)]).all(0)
     unit = frame.size[:, None]
     world_noise = None if noise.world_cov is None else noise.world_cov.divided(unit)
     noise = noise._replace(img=img, world=world / unit, world_cov=world_noise)
     points = (inputs.world_points - frame.centroid[:, None]) / unit[..., None]
     problem, _ = Normalize(center=False, scale=False, order=False)(points, *inputs[1:5], noise)
 
-    live, poses = frame.valid & known, []
-    eye = torch.eye(3, dtype=points.dtype, device=points.device)
-    given = [x.init for _, x in checked if x.init is not None]
-    for pose in given:
-        live = live & torch.cat((pose.rotation.flatten(1), pose.translation), 1).isfinite().all(1)
-    for pose in given:  # a refused problem gets a constant pose
-        rotation = torch.where(live[:, None, None], pose.rotation.detach(), eye)
-        poses.append(frame.apply(Pose(rotation, torch.where(live[:, None], pose.translation.detach(), eye[2]))))
+    axis = points.new_tensor([0.0, 0.0, 1.0])  # a refused problem gets a constant translation
+    poses = [Pose(pose.rotation, torch.where(live[:, None], pose.translation, axis)) for pose, _ in started]
     with points.device:
         refine = RobustWeightedLM(
             _MODE_ITERATIONS,
@@ -170,9 +163,9 @@ def monte_carlo_pose_loss(
     model = _Posterior(problem, _Prior(poses[0].translation), refine, points.new_tensor(scale), noisy_points)
     with torch.no_grad():
         drawn, log_proposal = _draw(model._replace(problem=problem.map(Tensor.detach)), poses, samples // count, rounds)
-    log_weights = model.log_density(drawn) - log_proposal
-    log_total = torch.logsumexp(log_weights, 0) - math.log(len(log_weights))
-    log_density = model.log_density(Pose(*(x[None] for x in poses[0])))[0] - log_total
+    log_densities = model.log_density(map_tensors(lambda x, y: torch.cat((x[None], y)), poses[0], drawn))
+    log_total = torch.logsumexp(log_densities[1:] - log_proposal, 0) - math.log(len(log_proposal))
+    log_density = log_densities[0] - log_total
     return torch.where(live, -log_density + 3.0 * frame.size.log(), 0.0).reshape(size)
 
 
@@ -288,11 +281,7 @@ class _Posterior(NamedTuple):
 
 
 def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[Pose, Tensor]:
-    """Draw samples from the prior, from a component around each pose, and from components around ``rounds`` modes.
-
-    Returns:
-        The samples, and the logarithm of the mixture's density at each sample, (S, B).
-    """
+    """Draw samples from the mixture, and compute the logarithm of its density at each sample, (S, B)."""
     mixture: list[_Prior | _Component] = [model.prior, *map(model.component, poses)]
     drawn = map_tensors(lambda *x: torch.cat(x), *[part.sample(each) for part in mixture])
 

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from kornia.geometry.camera import project_points
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_shapes, check_whole
+from kornia_pnpnet.core.checks import (
+    check_like,
+    check_numbers,
+    check_positive,
+    check_shapes,
+    check_tensors,
+    check_whole,
+)
+from kornia_pnpnet.core.linalg import lengths
+from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Noise, Starts
-from kornia_pnpnet.result import PnPResult, Pose, Problems, check_poses
+from kornia_pnpnet.result import PnPResult, Pose, Problems, check_pose, check_poses
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
@@ -23,25 +33,15 @@ _MOST_VARIANCES = 20.0
 
 
 class LossTerms(NamedTuple):
-    """The loss and its terms. Each field is a scalar, the mean over the batch.
+    """The loss and its terms. Each field is a scalar, the mean over the batch."""
 
-    Attributes:
-        total: weighted sum of the terms. The refined distances are saturated, see :class:`PoseLoss`.
-        init_rotation: chordal rotation distance of the first guess.
-        init_translation: translation distance of the first guess at the centroid of the points.
-        refined_rotation: chordal rotation distance after refinement.
-        refined_translation: translation distance after refinement.
-        weights: cross entropy of the weights, which are inlier probabilities; 0 in :class:`PoseLoss`.
-        noise: negative log-likelihood of the estimated noise; 0 in :class:`PoseLoss`.
-    """
-
-    total: Tensor
-    init_rotation: Tensor
-    init_translation: Tensor
-    refined_rotation: Tensor
-    refined_translation: Tensor
-    weights: Tensor
-    noise: Tensor
+    total: Tensor  #: Weighted sum of the terms. The refined distances are saturated, see :class:`PoseLoss`.
+    init_rotation: Tensor  #: Chordal rotation distance of the first guess.
+    init_translation: Tensor  #: Translation distance of the first guess at the centroid of the points.
+    refined_rotation: Tensor  #: Chordal rotation distance after refinement.
+    refined_translation: Tensor  #: Translation distance after refinement.
+    weights: Tensor  #: Cross entropy of the weights, which are inlier probabilities; 0 in :class:`PoseLoss`.
+    noise: Tensor  #: Negative log-likelihood of the estimated noise; 0 in :class:`PoseLoss`.
 
 
 def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -50,12 +50,11 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
     Args:
         estimate: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         truth: rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
-        origin: world point of each problem at which the translations are compared, :math:`(B, 3)`; ``None``: the
-            world's origin.
+        origin: world point at which the translations are compared, :math:`(B, 3)`; ``None``: the world's origin.
 
     Returns:
-        The rotation distance :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` for the angle :math:`\theta`, and the
-        translation distance :math:`\|\hat t - t\|`, each :math:`(B,)`.
+        The chordal rotation distance :math:`\|\hat R - R\|_F = 2\sqrt2 \sin(\theta / 2)` for the angle
+        :math:`\theta`, and the translation distance :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
         BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.
@@ -72,28 +71,27 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
     if origin is not None:
         check_shapes({"origin": (origin, tuple(translation.shape))})
         translation = translation + (rotation * origin[..., None, :]).sum(-1)
-    tiny = torch.finfo(rotation.dtype).tiny
-    return (rotation.square().sum((-2, -1)) + tiny).sqrt(), (translation.square().sum(-1) + tiny).sqrt()
+    return lengths(rotation.flatten(-2)), lengths(translation)
 
 
-def _refined_distances(
-    result: PnPResult, problems: Problems, ramp: float, origin: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Distances of the refined poses from the true poses, without gradient if ``ramp`` is 0."""
-    with torch.set_grad_enabled(torch.is_grad_enabled() and ramp > 0.0):
-        return pose_distances(result.pose, problems.pose, origin)
+def _centre(problems: Problems) -> Tensor:
+    """Centroids of the world points, (B, 3). The tensors of the problems must have one dtype and one device."""
+    check_pose("The pose of the problems", problems.pose)
+    tensors = {name: getattr(problems, name) for name in ("world_points", "img_points", "intrinsics")}
+    check_tensors(tensors)
+    check_like(tensors, problems.pose.translation, "the translation of the truth")
+    return problems.world_points.mean(-2)
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PoseLoss(nn.Module):
     r"""Weighted sum of the rotation and translation distances of the first guess and of the refined pose.
 
-    The refined translation is compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`. The
-    translation of the first guess is compared at the centroid of the world points. At an origin far from the points,
-    the translation error would mostly repeat the rotation error.
+    The refined translation is compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`, and
+    that of the first guess at the centroid of the points, because at a far origin it would repeat the rotation error.
 
-    The error of a failed refinement has no upper bound. The weighted refined distance :math:`d` of a problem is
-    therefore saturated to :math:`d / (1 + d / c)`. If :math:`c` is the largest distance of a successful pose, the loss
-    mainly counts failures.
+    The error of a failed refinement has no bound. The weighted refined distance :math:`d` of a problem is therefore
+    saturated to :math:`d / (1 + d / c)`. For the largest :math:`d` of a success as :math:`c`, this counts failures.
 
     Args:
         rotation: weight of the chordal rotation distances.
@@ -113,60 +111,53 @@ class PoseLoss(nn.Module):
         True
     """
 
-    def __init__(
-        self,
-        *,
-        rotation: float = 1.0,
-        translation: float = 0.1,
-        init_translation: float = 0.02,
-        refined: float = 1.0,
-        saturation: float | None = None,
-    ) -> None:
+    rotation: float = 1.0
+    translation: float = 0.1
+    init_translation: float = 0.02
+    refined: float = 1.0
+    saturation: float | None = None
+
+    def __post_init__(self) -> None:
         super().__init__()
-        self.saturation = math.inf if saturation is None else saturation
-        check_positive(saturation=self.saturation, or_infinite=True)
-        check_numbers(0.0, rotation=rotation, translation=translation)
-        check_numbers(0.0, init_translation=init_translation, refined=refined)
-        self.rotation, self.translation = rotation, translation
-        self.init_translation, self.refined = init_translation, refined
+        check_positive(saturation=math.inf if self.saturation is None else self.saturation, or_infinite=True)
+        check_numbers(0.0, rotation=self.rotation, translation=self.translation)
+        check_numbers(0.0, init_translation=self.init_translation, refined=self.refined)
 
     def forward(self, result: PnPResult, problems: Problems, ramp: float = 1.0) -> LossTerms:
-        r"""Compare a solver's result with the truth.
+        r"""Compare a solver's result with the true poses; ``BaseError`` when shape, dtype or device differ.
 
         Args:
             result: the result for :math:`B` problems.
             problems: the problems with their true poses.
             ramp: factor of the refined terms, 0 at the start of a training. At 0 the refined terms have no gradient.
-
-        Raises:
-            BaseError: when result and truth differ in shape, dtype or device.
         """
-        init_rotation, init_translation = pose_distances(result.init, problems.pose, problems.world_points.mean(-2))
-        rotation, translation = _refined_distances(result, problems, ramp)
+        init_rotation, init_translation = pose_distances(result.init, problems.pose, _centre(problems))
+        pose = result.pose if ramp > 0.0 else map_tensors(Tensor.detach, result.pose)
+        rotation, translation = pose_distances(pose, problems.pose)
         init = self.rotation * init_rotation + self.init_translation * init_translation
         refined = self.rotation * rotation + self.translation * translation
-        total = init + ramp * self.refined * refined / (1.0 + refined / self.saturation)
+        largest = math.inf if self.saturation is None else self.saturation
+        total = init + ramp * self.refined * refined / (1.0 + refined / largest)
         none = torch.zeros_like(total)
         terms = LossTerms(total, init_rotation, init_translation, rotation, translation, weights=none, noise=none)
         return map_tensors(torch.mean, terms)
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class SetLoss(nn.Module):
-    r"""The loss of a set network. The loss trains poses, inlier probabilities and noise.
+    r"""The loss of a set network, which trains poses, inlier probabilities and noise.
 
-    The loss has no unit, because translation distances at the centroid of the points are divided by the distance of the
-    centroid from the camera. The terms are:
+    Translations are compared at the centroid of the points, relative to its distance from the camera. The terms are:
 
     - First guess: a weighted mean of the best hypothesis's distance and the mean distance of all hypotheses. The best
-      hypothesis has most of the weight, so that the network can propose different hypotheses.
-    - Refined pose: the sum of both distances, each divided by its limit of success, and saturated as in
-      :class:`PoseLoss`.
+      one has most of the weight, so that hypotheses can differ.
+    - Refined pose: both distances, each divided by its limit of success, saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
     - Negative log-likelihood of the estimated noise, given the inliers' residuals at the true pose.
 
     Args:
         starts: number of the network's hypotheses, which are the first poses of the starts.
-        every: weight of the mean over the hypotheses. The best hypothesis has the weight ``1 - every``.
+        every: weight of the mean over the hypotheses. The best one has the weight ``1 - every``.
         refined: weight of the refined term, for ``ramp=1``.
         saturation: :math:`c` of :class:`PoseLoss`, as a multiple of the limits of success.
         weights: weight of the cross entropy.
@@ -178,37 +169,30 @@ class SetLoss(nn.Module):
         BaseError: for a negative weight, or a saturation or unit that is not positive.
     """
 
-    def __init__(
-        self,
-        *,
-        starts: int = 2,
-        every: float = 0.15,
-        refined: float = 1.0,
-        saturation: float = 2.0,
-        weights: float = 0.5,
-        noise: float = 0.02,
-        rotation_unit: float = 1.0,
-        translation_unit: float = 0.005,
-    ) -> None:
-        super().__init__()
-        check_whole(1, starts=starts)
-        check_numbers(0.0, 1.0, every=every)
-        check_numbers(0.0, refined=refined, weights=weights, noise=noise)
-        check_positive(saturation=saturation, or_infinite=True)
-        check_positive(rotation_unit=rotation_unit, translation_unit=translation_unit)
-        self.starts, self.every = starts, every
-        self.refined, self.saturation = refined, saturation
-        self.weights, self.noise = weights, noise
-        self.rotation_unit = 2.0**0.5 * math.radians(rotation_unit)  # as a chordal distance
-        self.translation_unit = translation_unit
+    starts: int = 2
+    every: float = 0.15
+    refined: float = 1.0
+    saturation: float = 2.0
+    weights: float = 0.5
+    noise: float = 0.02
+    rotation_unit: float = 1.0
+    translation_unit: float = 0.005
 
+    def __post_init__(self) -> None:
+        super().__init__()
+        check_whole(1, starts=self.starts)
+        check_numbers(0.0, 1.0, every=self.every)
+        check_numbers(0.0, refined=self.refined, weights=self.weights, noise=self.noise)
+        check_positive(saturation=self.saturation, or_infinite=True)
+        check_positive(rotation_unit=self.rotation_unit, translation_unit=self.translation_unit)
+
+    @full_precision
     def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Starts) -> LossTerms:
         """See :meth:`PoseLoss.forward`. ``guess``: starts of :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`."""
-        centre = problems.world_points.mean(-2)
-        rotation, translation = problems.pose
-        distance = ((rotation @ centre[..., None])[..., 0] + translation).norm(dim=-1)
-
+        centre = _centre(problems)
         every = [pose_distances(pose, problems.pose, centre) for pose in guess.poses[: self.starts]]
+        rotation, translation = problems.pose
+        distance = lengths((rotation @ centre[..., None])[..., 0] + translation)
         rotations, translations = (torch.stack(x, -1) for x in zip(*every, strict=True))  # (B, S) each
         translations = translations / distance[..., None]
         sums = rotations + translations
@@ -216,9 +200,11 @@ class SetLoss(nn.Module):
         init_rotation, init_translation, least = (x.gather(-1, best)[..., 0] for x in (rotations, translations, sums))
         first = (1.0 - self.every) * least + self.every * sums.mean(-1)
 
-        rotation, translation = _refined_distances(result, problems, ramp, centre)
+        pose = result.pose if ramp > 0.0 else map_tensors(Tensor.detach, result.pose)
+        rotation, translation = pose_distances(pose, problems.pose, centre)
         translation = translation / distance
-        refined = rotation / self.rotation_unit + translation / self.translation_unit
+        chordal_unit = 2.0**0.5 * math.radians(self.rotation_unit)
+        refined = rotation / chordal_unit + translation / self.translation_unit
         refined = refined / (1.0 + refined / self.saturation)
         probability = torch.where(problems.inliers, guess.weights, 1.0 - guess.weights)
         entropy = -probability.clamp(min=_LEAST_PROBABILITY).log().mean(-1)

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
-from kornia.core.exceptions import TypeCheckError, ValueCheckError
+from kornia.core.check import KORNIA_CHECK
+from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.subpix import spatial_expectation2d, spatial_softmax2d
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import Shapes, check_devices, check_positive, check_shapes, common_dtype, expand_sigma
-from kornia_pnpnet.result import Pose, camera_matrices
+from kornia_pnpnet.cameras import pinholes
+from kornia_pnpnet.core.checks import (
+    Shapes,
+    check_devices,
+    check_form,
+    check_positive,
+    check_shapes,
+    check_tensors,
+    common_dtype,
+    expand_sigma,
+)
+from kornia_pnpnet.core.performance import full_precision
+from kornia_pnpnet.result import Pose, camera_matrices, check_pose, with_rotation
 
 __all__ = ["depth_points", "heatmap_keypoints"]
 
@@ -19,16 +30,16 @@ __all__ = ["depth_points", "heatmap_keypoints"]
 _CELL_VARIANCE = 1.0 / 12.0
 
 
+@full_precision
 def heatmap_keypoints(
     heatmaps: Tensor, temperature: Tensor | float = 1.0, *, stride: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     r"""Keypoints and their covariances from heat maps: the mean and the covariance of the softmax of each map.
 
-    The softmax of a map is a density that is constant in each cell. The mean of the density is Kornia's soft-argmax.
-    The covariance of the density is the covariance of the cells' centres plus the variance of a cell, 1/12 per axis
-    (Sheppard's correction). The covariance is therefore positive definite even if all probability is in one cell. With
-    a loss such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`, a network can learn maps whose covariance is
-    the covariance of the keypoint's error.
+    The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance is
+    that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), and thus positive
+    definite even if all probability is in one cell. Through a loss such as
+    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`, it can learn to be the covariance of the keypoint's error.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
@@ -37,14 +48,12 @@ def heatmap_keypoints(
     Source: A. Nibali et al., "Numerical Coordinate Regression with Convolutional Neural Networks", 2018 (DSNT).
 
     Args:
-        heatmaps: logits, shape :math:`(B, N, H, W)`; :math:`B` stands for any number of leading dimensions. For maps
-            of probabilities pass their logarithms.
+        heatmaps: logits or logarithms of probabilities, shape :math:`(B, N, H, W)`, with any leading dimensions.
         temperature: positive divisor of the logits, a number or a tensor that broadcasts to ``heatmaps``.
         stride: image pixels per cell of the map. Cell 0 covers the first ``stride`` pixels.
 
     Returns:
-        A solver's ``img_points``, shape :math:`(B, N, 2)`, and its ``img_cov`` in px², shape :math:`(B, N, 2, 2)`. A
-        map with NaN gives NaN, and the problem of the map is then not ``ok``.
+        A solver's ``img_points`` (B, N, 2) and ``img_cov`` in px² (B, N, 2, 2). A map with NaN gives NaN.
 
     Raises:
         BaseError: when ``heatmaps`` is not a real tensor of maps with at least one cell, when ``temperature`` does not
@@ -60,26 +69,28 @@ def heatmap_keypoints(
         tensor([[[[0.7500, 0.0000],
                   [0.0000, 0.0833]]]])
     """
-    KORNIA_CHECK_SHAPE(heatmaps, ["*", "N", "H", "W"])
+    check_form(["*", "N", "H", "W"], heatmaps=heatmaps)
     KORNIA_CHECK(0 not in heatmaps.shape[-2:], f"A heat map needs at least one cell, got {tuple(heatmaps.shape)}.")
     check_positive(stride=stride)
-    if not isinstance(temperature, Tensor):
+    if isinstance(temperature, Tensor):
+        check_devices({"temperature": temperature}, heatmaps, "heatmaps")
+    else:
         check_positive(temperature=temperature)
     logits = heatmaps.to(common_dtype({"heatmaps": heatmaps})) / temperature
     check_shapes({"heatmaps / temperature": (logits, tuple(heatmaps.shape))})
+    *size, height, width = heatmaps.shape
     share = spatial_softmax2d(logits.reshape(heatmaps.shape[:-3].numel(), *heatmaps.shape[-3:]))
     mean = spatial_expectation2d(share, normalized_coordinates=False)  # (B, N, 2), cells
-    height, width = share.shape[-2:]
     u = torch.arange(width, dtype=share.dtype, device=share.device) - mean[..., :1]  # (B, N, W)
     v = torch.arange(height, dtype=share.dtype, device=share.device) - mean[..., 1:]  # (B, N, H)
     uu = (share.sum(-2) * u.square()).sum(-1) + _CELL_VARIANCE
     vv = (share.sum(-1) * v.square()).sum(-1) + _CELL_VARIANCE
     uv = (v * (share @ u[..., None])[..., 0]).sum(-1)
-    covariance = torch.stack((uu, uv, uv, vv), -1).reshape(*heatmaps.shape[:-2], 2, 2)
-    mean = mean.reshape(*heatmaps.shape[:-2], 2)
-    return stride * mean + 0.5 * (stride - 1.0), stride**2 * covariance
+    covariance = torch.stack((uu, uv, uv, vv), -1).reshape(*size, 2, 2)
+    return stride * mean.reshape(*size, 2) + 0.5 * (stride - 1.0), stride**2 * covariance
 
 
+@full_precision
 def depth_points(
     img_points: Tensor,
     depth: Tensor,
@@ -94,25 +105,24 @@ def depth_points(
 
     A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
     :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
-    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`. :math:`A` is the derivative
-    of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel. First-order propagation
-    of errors would omit the :math:`\sigma_d^2` next to :math:`d^2`.
+    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the
+    derivative of :math:`r` with respect to the pixel, and :math:`\Sigma` the covariance of the pixel.
 
     Args:
-        img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`; :math:`B` stands for any
-            number of leading dimensions, also for none.
-        depth: depth along the camera's z axis, in the unit of the world, shape :math:`(B, N)`.
+        img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`, with any leading dimensions.
+        depth: depth along the camera's z axis in the unit of the world, shape :math:`(B, N)`.
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
-        pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
+        pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`. The
+            nearest rotation replaces a matrix that is no exact rotation.
         depth_sigma: standard deviation of the depth in the unit of the world, a number, :math:`(B,)` or :math:`(B, N)`.
         img_sigma: see ``PnPNet.forward``. Pixels are exact if neither ``img_sigma`` nor ``img_cov`` is given.
         img_cov: see ``PnPNet.forward``.
 
     Returns:
         A solver's ``world_points``, shape :math:`(B, N, 3)`, and its ``world_cov`` in squared units of the world, shape
-        :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its pixel or depth is not
-        finite, or its sigma is negative. The solver's ``mask`` must exclude such a pair, else its problem is not
-        ``ok``.
+        :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its sigma is negative, a
+        number is not finite or so large that its fourth power overflows, or its camera or pose is invalid. The solver's
+        ``mask`` must exclude such a pair, else its problem is not ``ok``.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma
@@ -126,14 +136,13 @@ def depth_points(
         >>> points, covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         (tensor([[[0., 0., 2.]]]), tensor([[[0.0200, 0.0200, 0.1000]]]))
     """
-    for name, value in (("img_points", img_points), ("depth", depth)):
-        if not isinstance(value, Tensor):
-            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
-    KORNIA_CHECK_SHAPE(img_points, ["*", "N", "2"])
+    check_form(["*", "N", "2"], img_points=img_points)
+    check_pose("pose", pose)
     if img_sigma is not None and img_cov is not None:
         raise ValueCheckError("Give img_sigma or img_cov, not both.")
     *batch, count = img_points.shape[:-1]
     camera = camera_matrices(intrinsics)
+    check_tensors({"intrinsics": camera})
     shapes: Shapes = {
         "depth": (depth, (*batch, count)),
         "intrinsics": (camera, (3, 3) if camera.ndim == 2 else (*batch, 3, 3)),
@@ -143,18 +152,30 @@ def depth_points(
     }
     check_shapes(shapes)
     tensors = {name: tensor for name, (tensor, _) in shapes.items()}
+    sigmas = {"depth_sigma": depth_sigma, "img_sigma": img_sigma}
+    tensors |= {name: x for name, x in sigmas.items() if isinstance(x, Tensor)}
     check_devices(tensors, img_points, "img_points")
     dtype = common_dtype({"img_points": img_points, **tensors})
     pixels, depth, camera = (x.to(dtype) for x in (img_points, depth, camera))
-    rotation, translation = (x.to(dtype) for x in pose)
+    rotation, translation = with_rotation(Pose(*(x.to(dtype) for x in pose)))
     sigma_depth = expand_sigma("depth_sigma", depth_sigma, pixels)
     sigma_img = expand_sigma("img_sigma", 0.0 if img_sigma is None else img_sigma, pixels)
 
-    sound = (depth > 0) & depth.isfinite() & pixels.isfinite().all(-1) & (sigma_depth >= 0) & (sigma_img >= 0)
+    limit = torch.finfo(dtype).max ** 0.25  # fourth powers of smaller numbers are finite
+    eye = torch.eye(3, dtype=dtype, device=pixels.device)
+    camera, has_camera = pinholes(camera)
+    posed = has_camera & (torch.cat((rotation.flatten(-2), translation), -1).detach().abs() < limit).all(-1)
+    rotation = torch.where(posed[..., None, None], rotation, eye)
+    translation = torch.where(posed[..., None], translation, 0.0)
+    numbers = [pixels, *(x[..., None] for x in (depth, sigma_depth, sigma_img))]
+    numbers += [] if img_cov is None else [img_cov.to(dtype).flatten(-2)]
+    sound = posed[..., None] & (torch.cat(numbers, -1).detach().abs() < limit).all(-1)
+    sound = sound & (depth > 0) & (sigma_depth >= 0) & (sigma_img >= 0)
     depth, sigma_depth, sigma_img = (torch.where(sound, x, 1.0) for x in (depth, sigma_depth, sigma_img))
     pixels = torch.where(sound[..., None], pixels, 0.0)
-    eye = torch.eye(2, dtype=dtype, device=pixels.device)
-    noise = sigma_img.square()[..., None, None] * eye if img_cov is None else img_cov.to(dtype)
+    noise = sigma_img.square()[..., None, None] * eye[:2, :2]
+    if img_cov is not None:
+        noise = torch.where(sound[..., None, None], img_cov.to(dtype), eye[:2, :2])
 
     # Rays in the axes of the world. Kornia's unprojection is not used, because it ignores the skew.
     back = rotation.mT @ torch.linalg.inv_ex(camera).inverse  # (B, 3, 3)

@@ -6,9 +6,12 @@ import math
 from typing import NamedTuple
 
 import torch
+from kornia.core.exceptions import TypeCheckError
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_devices, check_shapes, check_whole
+from kornia_pnpnet.core.checks import check_devices, check_shapes, check_tensors, check_whole, common_dtype
+from kornia_pnpnet.core.linalg import lengths
+from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.refine.residual import rotation_angle
 from kornia_pnpnet.result import Pose, check_poses
 
@@ -19,48 +22,30 @@ _Z_95 = 1.959963984540054
 
 
 class PoseErrors(NamedTuple):
-    r"""Errors of a batch of poses.
+    """Errors of a batch of poses."""
 
-    Attributes:
-        rotation_error_deg: angle of :math:`\hat R R^\top` in degrees, shape :math:`(B,)`.
-        translation_error: :math:`\|\hat t - t\|` in the unit of the world, shape :math:`(B,)`.
-    """
-
-    rotation_error_deg: Tensor
-    translation_error: Tensor
+    rotation_error_deg: Tensor  #: Angle of :math:`\hat R R^\top` in degrees, shape :math:`(B,)`.
+    translation_error: Tensor  #: :math:`\|\hat t - t\|` in the unit of the world, shape :math:`(B,)`.
 
 
 class SuccessRate(NamedTuple):
-    """A success rate with its 95 % Wilson interval.
+    """A success rate with its 95 % Wilson interval."""
 
-    Attributes:
-        rate: share of successes, between 0 and 1.
-        low: lower bound of the interval.
-        high: upper bound of the interval.
-        total: number of trials.
-    """
-
-    rate: float
-    low: float
-    high: float
-    total: int
+    rate: float  #: Share of successes, between 0 and 1.
+    low: float  #: Lower bound of the interval.
+    high: float  #: Upper bound of the interval.
+    total: int  #: Number of trials.
 
     def __str__(self) -> str:
         return f"{100 * self.rate:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"
 
 
 class Reliability(NamedTuple):
-    r"""Predicted probabilities and observed frequencies in :math:`K` equally wide bins of probability.
+    r"""Predicted probabilities and observed frequencies in :math:`K` equally wide bins of probability."""
 
-    Attributes:
-        number: number of predictions, shape :math:`(K,)`.
-        predicted: mean predicted probability, NaN for an empty bin, shape :math:`(K,)`.
-        observed: share of true outcomes, NaN for an empty bin, shape :math:`(K,)`.
-    """
-
-    number: Tensor
-    predicted: Tensor
-    observed: Tensor
+    number: Tensor  #: Number of predictions, shape :math:`(K,)`.
+    predicted: Tensor  #: Mean predicted probability, NaN for an empty bin, shape :math:`(K,)`.
+    observed: Tensor  #: Share of true outcomes, NaN for an empty bin, shape :math:`(K,)`.
 
     @property
     def expected_error(self) -> float:
@@ -88,6 +73,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         >>> found.number.tolist(), f"{found.expected_error:.3f}"
         ([1.0, 3.0], '0.200')
     """
+    check_tensors({"chances": chances, "outcomes": outcomes})
     if chances.shape != outcomes.shape or chances.numel() == 0:
         shapes = f"{tuple(chances.shape)} and {tuple(outcomes.shape)}"
         raise ValueError(f"chances and outcomes must have the same shape and at least one element, got {shapes}.")
@@ -101,6 +87,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
     return Reliability(number, predicted / number, observed / number)
 
 
+@full_precision
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
     r"""Errors of estimated poses, rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)`.
 
@@ -115,19 +102,16 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
     """
     check_poses(estimate, truth)
     angle = rotation_angle(estimate.rotation, truth.rotation)
-    return PoseErrors(angle * (180.0 / math.pi), (estimate.translation - truth.translation).norm(dim=-1))
+    return PoseErrors(angle * (180.0 / math.pi), lengths(estimate.translation - truth.translation))
 
 
 def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: float | Tensor = 0.2) -> Tensor:
-    r"""Whether both errors are below their limits.
+    r"""Whether both errors are below their limits, bool :math:`(B,)`. False where an error is NaN.
 
     Args:
         errors: the errors of :math:`B` poses.
         max_rotation_deg: limit of the rotation error in degrees.
         max_translation: limit of the translation error in the unit of the world, a number or :math:`(B,)`.
-
-    Returns:
-        bool, shape :math:`(B,)`. False where an error is NaN.
 
     Raises:
         BaseError: when tensors are on different devices, or have other shapes.
@@ -136,32 +120,34 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         >>> success(PoseErrors(torch.tensor([0.5, 0.5, 2.0]), torch.tensor([0.1, 0.3, 0.1])))
         tensor([ True, False, False])
     """
+    check_tensors(errors._asdict())
+    for name, value in (("max_rotation_deg", max_rotation_deg), ("max_translation", max_translation)):
+        if not isinstance(value, (int, float, Tensor)):
+            raise TypeCheckError(f"{name} must be a number, got {type(value).__name__}.")
+    rotation, translation = errors
     limit = max_translation if isinstance(max_translation, Tensor) and max_translation.ndim else None
-    batch = tuple(errors.translation_error.shape)
-    check_shapes({"rotation_error_deg": (errors.rotation_error_deg, batch), "max_translation": (limit, batch)})
-    tensors = {"rotation_error_deg": errors.rotation_error_deg, "max_translation": limit}
-    check_devices(tensors, errors.translation_error, "translation_error")
-    return (errors.rotation_error_deg < max_rotation_deg) & (errors.translation_error < max_translation)
+    tensors = {"rotation_error_deg": rotation, "max_translation": limit}
+    check_shapes({name: (x, tuple(translation.shape)) for name, x in tensors.items()})
+    common_dtype({**tensors, "translation_error": translation})
+    check_devices(tensors, translation, "translation_error")
+    return (rotation < max_rotation_deg) & (translation < max_translation)
 
 
 def success_rate(successes: Tensor) -> SuccessRate:
     r"""Success rate with its 95 % Wilson score interval (E. B. Wilson, 1927).
 
-    Unlike the normal approximation, the interval stays inside [0, 1] and has a positive width at rates of 0 and 1.
-
     Args:
-        successes: bool, any shape with at least one element.
-
-    Raises:
-        ValueError: when ``successes`` is empty or not bool.
+        successes: bool, any shape with at least one element; else ``ValueError``.
 
     Example:
         >>> print(success_rate(torch.tensor([True] * 8 + [False] * 2)))
         80.0 % [49.0, 94.3]
     """
+    check_tensors({"successes": successes})
     count = successes.numel()
-    if count == 0 or successes.dtype != torch.bool:
-        raise ValueError(f"success_rate needs bool for at least one problem, got {count} of {successes.dtype}.")
+    if count == 0 or successes.dtype != torch.bool or successes.is_meta:
+        kind = f"{count} of {successes.dtype} on {successes.device}"
+        raise ValueError(f"successes must hold the values of bool for at least one problem, got {kind}.")
     rate = successes.to(torch.float64).mean().item()
     z = _Z_95
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)

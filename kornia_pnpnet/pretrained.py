@@ -11,7 +11,7 @@ from typing import Any, Self
 from kornia.core.exceptions import BaseError, ValueCheckError
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.files import atomic_open, digest
+from kornia_pnpnet.core.files import atomic_open, digest, write_json
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import describe
@@ -28,7 +28,7 @@ CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 _FINGERPRINT = "sha256"
 # Bytes. Upper limit of the part of a configuration file that is read. Every valid file is smaller.
 _LARGEST_CONFIG = 2**20
-# Integers up to this value are always accepted in a configuration, because tensors of such sizes take little memory.
+# Integers up to this value are accepted in every configuration: tensors of such sizes take little memory.
 _SMALL = 1000
 
 
@@ -38,20 +38,13 @@ def shipped_weights() -> list[str]:
 
 
 def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
-    """Write constructor arguments to ``config.json``, and named tensors to ``model.safetensors``.
-
-    A missing folder is created.
-
-    Raises:
-        OSError: when a file cannot be written.
-    """
+    """Write constructor arguments to ``config.json``, and named tensors to ``model.safetensors``, to a folder."""
     from safetensors.torch import save
 
     state = {name: value.detach().cpu().contiguous() for name, value in state.items()}
     with atomic_open(Path(folder) / WEIGHTS_NAME, "wb") as file:
         file.write(save(state, {"format": "pt", _FINGERPRINT: _fingerprint(config, state)}))
-    with atomic_open(Path(folder) / CONFIG_NAME) as text:
-        text.write(json.dumps(config, indent=2) + "\n")
+    write_json(Path(folder) / CONFIG_NAME, config)
 
 
 def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -59,7 +52,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
     Raises:
         FileNotFoundError: see :func:`find_weights`.
-        ValueCheckError: when the files are damaged or do not belong together.
+        ValueCheckError: when the files are damaged or do not match.
     """
     folder = find_weights(name_or_folder)
     from safetensors import SafetensorError, safe_open
@@ -93,16 +86,11 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
 
 def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
-    """Digest of a configuration and the weights that were saved with it."""
     return digest(config, *(part for item in sorted(state.items()) for part in item))
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
-    """Find the folder of weights.
-
-    Args:
-        name_or_folder: one of :func:`shipped_weights`, a local folder, or a repository id of the Hugging Face Hub.
-            Shipped weights are searched first, the Hub last.
+    """Find the folder of :func:`shipped_weights`, else a local folder, else a repository of the Hugging Face Hub.
 
     Raises:
         FileNotFoundError: when no shipped weights, folder or repository has this name.
@@ -155,7 +143,7 @@ class PretrainedMixin(nn.Module):
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:
-        """Return the constructor arguments of all parts and the options as plain data."""
+        """The constructor arguments of all parts, and the options, as plain data."""
         init = None if self.init is None else describe(self.init)
         return {"init": init, "refine": self.refine.config, "normalize": self.normalize.config, **self.options}
 

@@ -6,7 +6,7 @@ Tensors of pairs have the shapes ``(B, N)`` and ``(B, N, C)``. In memory the bat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -29,8 +29,8 @@ class State(NamedTuple):
 
     Attributes:
         pose: world-to-camera poses.
-        camera: unknown parameters of the camera, shape :math:`(B, K)`; :math:`K = 0` for a known camera. The first
-            parameter is :attr:`zoom`. The other parameters are the coefficients :math:`k_1, k_2` of radial distortion.
+        camera: unknown parameters of the camera, first :attr:`zoom`, then the coefficients :math:`k_1, k_2` of radial
+            distortion, shape :math:`(B, K)`; :math:`K = 0` for a known camera.
     """
 
     pose: Pose
@@ -43,10 +43,7 @@ class State(NamedTuple):
 
     @property
     def zoom(self) -> Tensor:
-        """Logarithm of the ratio of the focal length to ``Problem.focal``, shape :math:`(B, 1)`.
-
-        For a known focal length the shape is :math:`(B, 0)`.
-        """
+        """Logarithm of the focal length divided by ``Problem.focal``, :math:`(B, 1)`; :math:`(B, 0)` if it is known."""
         return self.camera[:, :1]
 
     @property
@@ -123,15 +120,13 @@ class Problem(NamedTuple):
         focal: the focal length in pixels that all pairs share, a scalar.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
-        usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), 0 for all other pairs, shape
-            :math:`(B, N)`. Initialisers that are not robust use :attr:`usual_weights`.
-        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; ``None``:
-            unknown for all pairs.
-        confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`;
-            ``None``: unknown for all pairs.
+        usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), else 0, shape :math:`(B, N)`.
+        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; or ``None``.
+        confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`; or
+            ``None``.
         rig: the transform from the rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose
             of the problem is then the pose of the rig. ``None``: one camera.
-        prior: prior of the pose, a :class:`~kornia_pnpnet.refine.terms.PoseTerm`; ``None``: no prior.
+        prior: prior of the pose, a :class:`~kornia_pnpnet.refine.terms.PoseTerm`; or ``None``.
         free_focal: range and prior of an unknown focal length, a :class:`~kornia_pnpnet.refine.terms.CameraTerm`;
             ``None``: the focal length is ``focal``.
     """
@@ -158,15 +153,15 @@ class Problem(NamedTuple):
         return cls(world_points, img_points, focal=torch.as_tensor(focal).to(one), **given)
 
     @property
-    def terms(self) -> Iterator[Term]:
+    def terms(self) -> tuple[Term, ...]:
         """The prior terms. An unknown focal length without information (no ``focal_sigma``) adds no term."""
         free = self.free_focal is not None and self.free_focal.information is not None
         known = self.prior, self.free_focal if free else None
-        return (term for term in known if term is not None)
+        return tuple(term for term in known if term is not None)
 
     @property
     def usual_weights(self) -> Tensor:
-        """The weights, 0 for pairs that are not usual, shape :math:`(B, N)`."""
+        """The weights, 0 for pairs that are not usual, for initialisers that are not robust, :math:`(B, N)`."""
         return self.weights * self.usual
 
     @property
@@ -225,12 +220,9 @@ class Starts(NamedTuple):
     @property
     def poses(self) -> list[Pose]:
         """``pose`` and ``others`` in one list, each pose with the shapes :math:`(B, 3, 3)` and :math:`(B, 3)`."""
-        others = (
-            ()
-            if self.others is None
-            else map(Pose, self.others.rotation.unbind(-3), self.others.translation.unbind(-2))
-        )
-        return [self.pose, *others]
+        if self.others is None:
+            return [self.pose]
+        return [self.pose, *map(Pose, self.others.rotation.unbind(-3), self.others.translation.unbind(-2))]
 
     def with_others(self, *more: Pose) -> Starts:
         """Add more poses to ``others``."""

@@ -35,7 +35,7 @@ _PAPERS_SAMPLE = 7
 
 
 def _trained(weights: str, m: int | None = None) -> PnPNet:
-    """A solver with shipped weights and ``m`` iterations (0: the network alone, the paper's "Net")."""
+    """A solver with ``m`` iterations (0: the network alone, the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
     return solver if m is None else solver.with_options(refine=solver.refine.with_iterations(m))
 
@@ -110,11 +110,10 @@ def create_solver(name: str, **options: Any) -> nn.Module:
     Args:
         name: one of :func:`list_solvers`.
         options: depend on the solver. Trained solvers and names with ``-lm`` take ``m``, the number of iterations (see
-            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers that use
-            :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP` or
-            :class:`~kornia_pnpnet.propose.ransac.RANSAC` take the arguments of that class. Solvers of other libraries
-            take the arguments of their class in :mod:`kornia_pnpnet.peers`. Solvers of this package also take the
-            options of :class:`~kornia_pnpnet.solver.PnPNet`.
+            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers take the arguments of their
+            class: :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP`,
+            :class:`~kornia_pnpnet.propose.ransac.RANSAC` or one of :mod:`kornia_pnpnet.peers`. Solvers of this package
+            also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode. Its parameters do not require gradients, so that a result has a
@@ -179,7 +178,7 @@ def solve_pnp(
     Returns:
         Matrices :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`. The dtype is float64 if any
         input is float64, else float32. Gradients flow to points, pixels, intrinsics and weights. The matrix of a
-        problem whose ``ok`` is false is NaN without gradient. Such a problem raises no error.
+        problem whose ``ok`` is false is NaN without gradient.
 
     Raises:
         ValueCheckError: for an unknown name.

@@ -13,6 +13,7 @@ from enum import IntEnum, unique
 from typing import Any, NamedTuple
 
 import torch
+from kornia.core.exceptions import TypeCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import (
     Rt_to_matrix4x4,
@@ -24,9 +25,16 @@ from kornia.geometry.conversions import (
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import Shapes, check_like, check_shapes
-from kornia_pnpnet.core.linalg import gate
-from kornia_pnpnet.core.performance import sees_values
+from kornia_pnpnet.core.checks import (
+    check_devices,
+    check_form,
+    check_like,
+    check_shapes,
+    check_tensors,
+    common_dtype,
+)
+from kornia_pnpnet.core.linalg import gate, nearest_rotation
+from kornia_pnpnet.core.performance import full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 
 __all__ = [
@@ -37,8 +45,10 @@ __all__ = [
     "Problems",
     "Status",
     "camera_matrices",
+    "check_pose",
     "check_poses",
     "gate_pose",
+    "with_rotation",
 ]
 
 
@@ -73,7 +83,7 @@ class Pose(NamedTuple):
             >>> pose.rvec
             tensor([[0.0000, 0.0000, 0.5000]])
         """
-        return cls(axis_angle_to_rotation_matrix(rvec), translation)
+        return cls(*_of_vectors(axis_angle_to_rotation_matrix, "rvec", rvec, 3, translation))
 
     @classmethod
     def from_quaternion(cls, quaternion: Tensor, translation: Tensor) -> Pose:
@@ -83,7 +93,7 @@ class Pose(NamedTuple):
             quaternion: any length but 0, shape :math:`(B, 4)`.
             translation: shape :math:`(B, 3)`.
         """
-        return cls(quaternion_to_rotation_matrix(quaternion), translation)
+        return cls(*_of_vectors(quaternion_to_rotation_matrix, "quaternion", quaternion, 4, translation))
 
     @property
     def rvec(self) -> Tensor:
@@ -134,6 +144,18 @@ class Pose(NamedTuple):
         return PinholeCamera(Rt_to_matrix4x4(matrices, no_shift), self.matrix.reshape(-1, 4, 4), *size)
 
 
+def _of_vectors(
+    rotate: Callable[[Tensor], Tensor], name: str, vectors: Tensor, length: int, translation: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Check vectors (*, length) and translations (*, 3), and convert them to poses of one dtype."""
+    check_form(["*", "3"], translation=translation)
+    check_shapes({name: (vectors, (*translation.shape[:-1], length))})
+    tensors = {name: vectors, "translation": translation}
+    check_devices(tensors, translation, "translation")
+    dtype = common_dtype(tensors)
+    return rotate(vectors.to(dtype)), translation.to(dtype)
+
+
 def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
     """Camera matrices (B, 3, 3) or (3, 3) of ``intrinsics``. The extrinsics of Kornia's camera are ignored."""
     if not isinstance(intrinsics, PinholeCamera):
@@ -142,18 +164,33 @@ def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
     return matrices[0] if len(matrices) == 1 else matrices
 
 
+def check_pose(name: str, pose: Pose) -> None:
+    """Check the types of a pose and of its tensors."""
+    if not isinstance(pose, Pose):
+        raise TypeCheckError(f"{name} must be a Pose, got {type(pose).__name__}.")
+    check_tensors({f"{name} {part}": x for part, x in pose._asdict().items()})
+
+
 def check_poses(estimate: Pose, truth: Pose) -> None:
     """Check that two batches of poses agree in shape, dtype and device. Broadcasting would mix up problems."""
-    batch = tuple(estimate.translation.shape[:-1])
-    shapes: Shapes = {
-        "The rotation of the estimate": (estimate.rotation, (*batch, 3, 3)),
-        "The translation of the estimate": (estimate.translation, (*batch, 3)),
-        "The rotation of the truth": (truth.rotation, (*batch, 3, 3)),
-        "The translation of the truth": (truth.translation, (*batch, 3)),
-    }
-    check_shapes(shapes)
-    tensors = {name: tensor for name, (tensor, _) in shapes.items()}
+    check_pose("estimate", estimate)
+    check_pose("truth", truth)
+    shape = tuple(estimate.translation.shape)
+    tensors: dict[str, Tensor] = {}
+    for name, pose in (("estimate", estimate), ("truth", truth)):
+        tensors |= {f"The rotation of the {name}": pose.rotation, f"The translation of the {name}": pose.translation}
+    check_shapes({name: (x, (*shape, 3) if "rotation" in name else shape) for name, x in tensors.items()})
     check_like(tensors, truth.translation, "the translation of the truth")
+
+
+@full_precision
+def with_rotation(pose: Pose) -> Pose:
+    """Replace each matrix, ``(*, 3, 3)``, by the nearest rotation, or by NaN if its determinant is not positive."""
+    matrices = pose.rotation.reshape(-1, 3, 3)
+    rotation, unique = nearest_rotation(matrices.permute(1, 2, 0))
+    usable = unique & (torch.linalg.det(matrices.detach()) > 0)
+    rotation = torch.where(usable[:, None, None], rotation.permute(2, 0, 1), torch.nan)
+    return Pose(rotation.reshape(pose.rotation.shape), pose.translation)
 
 
 def gate_pose(pose: Pose, live: Tensor, finite: Tensor) -> Pose:
@@ -194,8 +231,9 @@ class Status(IntEnum):
     TOO_FEW_PAIRS = 1
     #: The points lie on a line or coincide, or the pairs do not determine a pose.
     DEGENERATE = 2
-    #: An input is invalid: a coordinate, weight or covariance that is not finite, an infinite sigma, a negative weight
-    #: or sigma, a covariance that is not positive semi-definite, or an invalid prior.
+    #: An input is invalid: a coordinate, weight or covariance that is not finite, a sigma whose fourth power is
+    #: infinite, a negative weight or sigma, a covariance that is not positive semi-definite, an invalid prior, or a
+    #: camera of a rig whose determinant is not positive.
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``, ``fx`` or ``fy`` is 0, or almost
     #: all pixels are 89.9 degrees off the optical axis, so that the intrinsics do not fit the pixels.
@@ -333,43 +371,44 @@ class PnPResult(NamedTuple):
             img_points: the pixels of the solver's call.
             intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the ``intrinsics`` of the
                 result replace them.
-            noise: further arguments of ``pose_covariance``. If no noise of the pixels is given, the noise is
-                ``sigma``. The default weights are ``inliers``.
+            noise: further arguments of ``pose_covariance``. Noise that is not given is estimated from the residuals of
+                the inliers (see :func:`~kornia_pnpnet.covariance.shown_noise`); if only noise of the points is given,
+                the noise of the pixels is ``sigma``. The default weights are ``inliers``.
 
         Returns:
             Shape :math:`(B, 6, 6)`, see ``pose_covariance``.
         """
-        from kornia_pnpnet.covariance import pose_covariance
+        from kornia_pnpnet.covariance import pose_covariance, shown_noise
 
         if noise.get("focal") == "unknown" and self.intrinsics is not None:
             intrinsics = self.intrinsics
-        if "img_sigma" not in noise and "img_cov" not in noise:
-            noise["img_sigma"] = self.sigma
         if "weights" not in noise and self.inliers is not None:
             noise["weights"] = self.inliers.to(self.rotation.dtype)
+        if not {"img_sigma", "img_cov", "world_sigma", "world_cov"}.isdisjoint(noise):
+            noise.setdefault("img_sigma", None if "img_cov" in noise else self.sigma)
+        else:
+            noise |= shown_noise(self.pose, world_points, img_points, intrinsics, noise.get("weights"))
         return pose_covariance(self.pose, world_points, img_points, intrinsics, **noise)
 
 
 class Problems(NamedTuple):
     r"""A batch of problems with their true poses. Every data source yields such batches.
 
+    The fields from ``img_sigma`` on are inputs of solvers; for shapes and units see :meth:`PnPNet.forward
+    <kornia_pnpnet.solver.PnPNet.forward>`.
+
     Attributes:
         world_points: shape :math:`(B, N, 3)`.
         img_points: pixels, shape :math:`(B, N, 2)`.
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
-        pose: the true world-to-camera pose.
+        pose: the true world-to-camera pose, in a rig the pose of the rig.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate, an input of solvers, shape :math:`(B,)` or
-            :math:`(B, N)`. NaN: unknown. ``None``: unknown for all problems.
-        world_sigma: standard deviation of the noise on each world coordinate; see ``img_sigma``.
-        confidence: belief that a pair is an inlier, in [0, 1], shape :math:`(B, N)`; NaN and ``None`` as for
-            ``img_sigma``.
-        img_cov: covariance of the noise of each pixel, which replaces ``img_sigma`` as an input, shape
-            :math:`(B, N, 2, 2)`; ``None``: unknown.
-        world_cov: covariance of the noise of each world point, which replaces ``world_sigma`` as an input, shape
-            :math:`(B, N, 3, 3)`; ``None``: unknown.
-        cam_from_rig: the transform from a rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`.
-            ``pose`` is then the pose of the rig. ``None``: one camera.
+        img_sigma: standard deviation of the noise on each pixel coordinate; ``None``: unknown, also below.
+        world_sigma: standard deviation of the noise on each world coordinate.
+        confidence: belief that a pair is an inlier.
+        img_cov: covariance of the noise of each pixel, in place of ``img_sigma``.
+        world_cov: covariance of the noise of each world point, in place of ``world_sigma``.
+        cam_from_rig: the transform from a rig to the camera of each pair; ``None``: one camera.
     """
 
     world_points: Tensor
@@ -387,17 +426,16 @@ class Problems(NamedTuple):
     @property
     def sigmas(self) -> dict[str, Tensor]:
         """The known standard deviations, as keyword arguments of a solver's call."""
-        sigmas = {"img_sigma": self.img_sigma, "world_sigma": self.world_sigma}
-        return {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+        return {name: x for name, x in self.known.items() if name in ("img_sigma", "world_sigma")}
 
     @property
     def known(self) -> dict[str, Any]:
         """The known noise, the confidences and the rig, as keyword arguments of a solver's call."""
-        more = {"img_cov": self.img_cov, "world_cov": self.world_cov, "confidence": self.confidence}
-        known = {**more, "cam_from_rig": self.cam_from_rig}
-        return {**self.sigmas, **{name: value for name, value in known.items() if value is not None}}
+        # All optional fields are such arguments.
+        return {name: x for name, x in self._asdict().items() if name in self._field_defaults and x is not None}
 
     @property
+    @full_precision
     def true_cam_points(self) -> Tensor:
         """The points in the frame of their camera at the true pose, shape :math:`(B, N, 3)`."""
         points = self.world_points @ self.pose.rotation.mT + self.pose.translation[..., None, :]

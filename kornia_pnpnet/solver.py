@@ -82,22 +82,20 @@ class PnPNet(PretrainedMixin):
         normalize: the normalisation; the default centres and scales the world and sorts the pairs.
         effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples (see
             :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
-            :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
-            adaptive in evaluation mode if the initialiser estimates the noise and the refinement has iterations, else
-            fixed. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in ``torch.func.vmap``
-            and on the device ``meta``. For rigs and bearings the number of minimal samples is adaptive unless the
-            effort is ``"fixed"`` or the solver is compiled. In evaluation mode, and unless the effort is ``"fixed"``,
-            poses of every solver are compared with their rivals (see
-            :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
+            :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. Other
+            efforts compare poses with their rivals in evaluation mode (see
+            :func:`~kornia_pnpnet.propose.alternatives.reconsider`). ``None``: adaptive in evaluation mode if the
+            initialiser estimates the noise and the refinement has iterations, else fixed. The effort is always fixed in
+            exported graphs, with ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``. For rigs
+            and bearings the number of minimal samples is adaptive unless the effort is ``"fixed"`` or the solver is
+            compiled.
         gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``, with a ``RuntimeWarning``
             if the first batches of a training have none. ``"always"``: all valid problems. The gradient of each
             problem's loss with respect to its normalised inputs then has a norm of at most 10. A step against the
-            gradient lowers the loss, but the loss of a pose does not determine where the pixels move: a pose has 6
-            numbers, N pixels have 2N. To train a network from nothing, use
-            :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
-        views: number of views of each problem, 1 to 8. The first view is the problem itself, and all others are its
-            mirror images (see :mod:`kornia_pnpnet.propose.views`). A network proposes different poses for different
-            views. The first 70 % of the iterations refine all poses, and the last 30 % only the best pose.
+            gradient lowers the loss, but a pose does not determine where the pixels move. To train a network from
+            nothing, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+        views: number of views of each problem, 1 to 8: the problem itself and its mirror images, for which a network
+            proposes different poses (see :mod:`kornia_pnpnet.propose.views`).
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
             focal length. With ``SetInit`` the refinement starts from a nominal focal length. If this refinement fails,
@@ -191,8 +189,8 @@ class PnPNet(PretrainedMixin):
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
                 of the initialiser. Without an initialiser the refinement starts from ``init`` alone. The nearest
-                rotation replaces a matrix that is no exact rotation, also in ``prior``. A pose is ignored if it is not
-                finite, or if the determinant of its matrix is not positive.
+                rotation replaces a matrix that is no exact rotation, also in ``prior`` and ``cam_from_rig``. A pose is
+                ignored if it is not finite, or if the determinant of its matrix is not positive.
             img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
                 :math:`(B, N)`, at least 0; NaN where unknown. With ``img_sigma`` or ``world_sigma``, residuals and the
                 scales of the refinement's kernel are in standard deviations.
@@ -293,10 +291,9 @@ class PnPNet(PretrainedMixin):
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
         """Compile the solver in place with ``torch.compile``: the first stage, an iteration, and the final stage.
 
-        The first call compiles for some seconds, or less with a disk cache of ``torch.compile``. Further calls take a
-        fraction of the uncompiled time. The size of the batch may change without a new compilation. A new number of
-        pairs, a new dtype, or gradients cause a new compilation. Parts that cannot be compiled (RANSAC, or all parts
-        without a C++ compiler) run uncompiled after one warning. A copy of the solver compiles again.
+        The first call compiles for some seconds. A new number of pairs, a new dtype, or gradients cause a new
+        compilation, another size of the batch does not. Parts that cannot be compiled (RANSAC, or all parts without a
+        C++ compiler) run uncompiled after one warning. A copy of the solver compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
@@ -393,21 +390,24 @@ class PnPNet(PretrainedMixin):
         pose, first = frame.undo(refined.pose), frame.undo(starts.pose)
         # A sum is finite only if all its terms are finite. The rotation needs no test, because its products with the
         # centroid are terms of the translation.
-        finite = frame.valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
+        valid = frame.valid
+        finite = valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if starts.ok is None else finite & refined.ok & starts.ok
         state, intrinsics, found = refined.state, frame.intrinsics, refined.evidence
         if state.camera.shape[1]:
             intrinsics = scale_focal(intrinsics, torch.where(finite, state.camera[:, 0], 0.0).exp())
-        first_ok = frame.valid & first.translation.sum(-1).isfinite()
+        first_ok = valid & first.translation.sum(-1).isfinite()
         status = torch.where(refined.in_front, Status.NOT_BELIEVED.value, Status.BEHIND.value)
         status = torch.where(finite, status, Status.DEGENERATE.value)
         if frame.ignored is not None:
             status = torch.where(frame.ignored > 0, frame.ignored, status)
         status = torch.where(ok, Status.SOLVED.value, status)
         # int64 until here, because `where` of ONNX Runtime does not support int8.
-        status = torch.where(frame.valid, status, frame.status).to(torch.int8)
+        status = torch.where(valid, status, frame.status).to(torch.int8)
         live = finite if call.always else ok
         pose = gate_pose(pose, live, finite)
+        with torch.no_grad():
+            sigma = torch.where(finite, found.sigma * focal / frame.img_scale, 0.0)
         # In a rig, `forward` returns the cameras as they were given.
         cameras: Any = None if intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         return PnPResult(
@@ -421,7 +421,7 @@ class PnPNet(PretrainedMixin):
             Alternatives.none(pose),
             cameras,
             gate(as_dist(state.radial), live, finite, 0.0),
-            torch.where(finite, found.sigma * focal / frame.img_scale, 0.0),
+            sigma,
             frame.undo_pairs(found.inlier).gt(0.5) & finite[:, None],
         )
 
@@ -439,6 +439,7 @@ class PnPNet(PretrainedMixin):
         can = trait(self.init, "estimates_noise") and self.refine.m > 0
         return self.effort == "adaptive" or (can and not self.training)
 
+    @torch.no_grad()
     def _with_alternatives(self, attempt: _Attempt, result: PnPResult, most: int) -> PnPResult:
         """Add to a result the other poses that explain the pairs nearly as well."""
         frame, problem = attempt.frame, attempt.problem.seen_with(attempt.refined.state.zoom)

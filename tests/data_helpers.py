@@ -43,15 +43,9 @@ def draw(n=9, batch=COUNT, **options):
     return SyntheticProblems(n=n, batch_size=batch, seed=7, dtype=torch.float64, **options).batch(0)
 
 
-def transform(pose, points):
-    """Points in the camera's frame, (B, N, 3)."""
-    return points @ pose.rotation.mT + pose.translation[:, None]
-
-
 def reprojection(problems):
     """Projections under the true pose less the pixels, (B, N, 2)."""
-    pose = problems.pose
-    projected = (problems.world_points @ pose.rotation.mT + pose.translation[:, None]) @ problems.intrinsics.mT
+    projected = problems.true_cam_points @ problems.intrinsics.mT
     return projected[..., :2] / projected[..., 2:] - problems.img_points
 
 

@@ -7,19 +7,18 @@ import multiprocessing
 import os
 import pickle
 import threading
-import warnings
+from unittest.mock import Mock
 
 import pytest
 import torch
+from helpers import assert_same
 from torch import nn
 from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
-from kornia_pnpnet.core.performance import INLINE, Compiled, ascending_order, in_order, in_turn, ranked
-from kornia_pnpnet.core.trees import iter_tensors
+from kornia_pnpnet.core.performance import INLINE, Runner, ascending_order, in_order, in_turn, ranked
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
-from kornia_pnpnet.result import PnPResult
 
 # torch.compile makes an instance of an autograd function while it looks into it.
 pytestmark = pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
@@ -44,34 +43,33 @@ def problems(count, n=9, dtype=torch.float64):
     return SyntheticProblems(n=n, batch_size=count, seed=5, outliers=OutlierMix(), dtype=dtype).batch(0)
 
 
-def assert_same(result, expected, **tolerance):
-    assert type(result) is PnPResult
-    for a, b in zip(iter_tensors(result), iter_tensors(expected), strict=True):
-        torch.testing.assert_close(a, b, **tolerance)
-
-
 @pytest.mark.parametrize(
-    ("name", "views", "whole"),
+    ("name", "views", "whole", "cameras"),
     [
-        ("pnpnet-n9", 2, False),
-        pytest.param("pnpnet-n9", 3, True, marks=pytest.mark.slow),
+        ("pnpnet-n9", 2, False, 1),
         *(
-            pytest.param(name, 1, False, marks=pytest.mark.slow)
-            for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "pnpnet-set")
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("pnpnet-n9", 3, True, 1),
+                *((name, 1, False, 1) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "pnpnet-set")),
+                *(("pnpnet-set", 1, whole, 3) for whole in (False, True)),
+            )
         ),
     ],
 )
-def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, backend):
-    eager, compiled = create_solver(name, m=2), create_solver(name, m=2)
+def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, cameras, backend):
+    solvers = [create_solver(name, m=2, views=views, effort="fixed" if cameras > 1 else None) for _ in range(2)]
     tolerance = 1e-4 if name == "pnpnet-set" else 1e-6  # its softmax in float32 rounds otherwise in a graph
-    eager.views = compiled.views = views
-    compiled.compile(whole=whole)
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        graphs = 0
+    solvers[1].compile(whole=whole)
+    graphs = 0
+    with torch.no_grad():
         for count in (64, 7, 5, 1):
-            inputs = problems(count)[:3]
-            assert_same(compiled(*inputs), eager(*inputs), rtol=tolerance, atol=tolerance)
+            p = problems(count)
+            if cameras > 1:
+                options = {"outlier_share": 0.25, "cameras": cameras, "dtype": torch.float64}
+                p = CameraProblems(n=12, batch_size=count, seed=5, **options).batch(0)
+            results = [solver(*p[:3], cam_from_rig=p.cam_from_rig) for solver in solvers]
+            assert_same(*results, rtol=tolerance, atol=tolerance)
             graphs = graphs or backend.frame_count
     assert backend.frame_count == (1 if whole else graphs)
 
@@ -108,56 +106,28 @@ def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(whole, backend):
         with pytest.warns(RuntimeWarning, match="Not compiled, running uncompiled") as caught:
             first = compiled(*inputs)
         assert len(caught) == 1
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)
-            second = compiled(*inputs)
-        for result in (first, second):
-            assert_same(result, eager(*inputs), rtol=0, atol=0)
+        for result in (first, compiled(*inputs)):
+            assert_same(result, eager(*inputs))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("whole", [False, True])
-def test_rigs_are_graphs(whole, backend):
-    eager, compiled = create_solver("pnpnet-set", m=2, effort="fixed"), create_solver("pnpnet-set", m=2)
-    compiled.compile(whole=whole)
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        for count in (7, 64, 1):
-            data = CameraProblems(n=12, batch_size=count, seed=5, outlier_share=0.25, cameras=3, dtype=torch.float64)
-            rigs = data.batch(0)
-            results = [solver(*rigs[:3], cam_from_rig=rigs.cam_from_rig) for solver in (compiled, eager)]
-            assert_same(*results, rtol=1e-4, atol=1e-4)  # two iterations from a pose of the search in float32
-    assert not whole or backend.frame_count == 1
-
-
-def raises(error):
-    def function(*args, **options):
-        raise error
-
-    return function
-
-
-OLD = raises(TypeError("compile() got an unexpected keyword argument"))  # PyTorch before 2.13
-
-
-@pytest.mark.parametrize("compile_", [OLD, lambda function, **options: raises(RuntimeError("no compiler got here"))])
-def test_without_a_compiler_it_runs_as_it_is(compile_, monkeypatch):
-    monkeypatch.setattr(torch, "compile", compile_)
-    twice = Compiled(lambda x: 2 * x)
-    with pytest.warns(RuntimeWarning, match="Not compiled, running uncompiled.* got ") as caught:
-        assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))
+@pytest.mark.parametrize("when", ["compile", "call"])
+def test_without_a_compiler_it_runs_as_it_is(when, monkeypatch):
+    failing = Mock(side_effect=RuntimeError("no compiler"))
+    monkeypatch.setattr(torch, "compile", failing if when == "compile" else lambda function, **options: failing)
+    run = Runner(True)
+    with pytest.warns(RuntimeWarning, match=r"Not compiled, running uncompiled.*no compiler") as caught:
+        assert run(torch.neg, torch.ones(1)) == -1
     assert len(caught) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        assert torch.equal(twice(torch.ones(3)), 2 * torch.ones(3))
+    assert run(torch.neg, torch.ones(1)) == -1
 
 
 def test_too_little_memory_is_no_failure_of_the_compiler(monkeypatch):
-    monkeypatch.setattr(torch, "compile", lambda function, **options: raises(torch.cuda.OutOfMemoryError("too large")))
-    twice = Compiled(lambda x: 2 * x)
+    full = Mock(side_effect=torch.cuda.OutOfMemoryError("too large"))
+    monkeypatch.setattr(torch, "compile", lambda function, **options: full)
+    run = Runner(True)
     with pytest.raises(torch.cuda.OutOfMemoryError):
-        twice(torch.ones(3))
-    assert not twice.failed
+        run(torch.neg, torch.ones(3))
+    assert not run.failed
 
 
 def test_errors_of_the_caller_are_the_callers(backend):
@@ -169,12 +139,11 @@ def test_errors_of_the_caller_are_the_callers(backend):
     with pytest.raises(Exception, match=r"built for n = 9"):
         solver(world[:, :8], img[:, :8], intrinsics)
 
-    twice = Compiled(lambda x: 2 * in_order(x))  # of three dimensions
+    run, x = Runner(True), torch.rand(2, 3, 4)
     with pytest.raises(IndexError):
-        twice(torch.ones(3))
-    x = torch.rand(2, 3, 4)
-    assert torch.equal(twice(x), 2 * in_order(x))
-    assert not twice.failed
+        run(in_order, x[0, 0])
+    assert torch.equal(run(in_order, x), in_order(x))
+    assert not run.failed
 
 
 class Scaled(nn.Module):
@@ -183,19 +152,22 @@ class Scaled(nn.Module):
     def __init__(self):
         super().__init__()
         self.scale = nn.Parameter(torch.ones(1))
-        self.run = Compiled(self.forward)
+        self.run = Runner(True)
 
     def forward(self, x):
+        return self.run(self.scaled, x)
+
+    def scaled(self, x):
         return self.scale * x
 
 
 def test_copies_use_their_own_weights(backend):
     module, x = Scaled(), torch.ones(3)
-    assert torch.equal(module.run(x), x)
+    assert torch.equal(module(x), x)
     for other in (copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
         other.load_state_dict({"scale": torch.full((1,), 0.5)})
-        assert torch.equal(other.run(x), 0.5 * x)
-        assert torch.equal(module.run(x), x)
+        assert torch.equal(other(x), 0.5 * x)
+        assert torch.equal(module(x), x)
     assert backend.frame_count == 3
 
 
@@ -217,19 +189,16 @@ def test_inductor_computes_the_same(whole):
     solver = PnPNet(MLPInit(6), RobustWeightedLM(3), views=2).double()
     compiled = copy.deepcopy(solver)
     compiled.compile(whole=whole)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        for count in (50, 31, 1):
-            inputs = problems(count, n=6)[:3]
-            with torch.no_grad():
-                assert_same(compiled(*inputs), solver(*inputs), rtol=1e-6, atol=1e-8)
-        grads = []
-        for net in (solver, compiled):
-            result = net(*problems(50, n=6)[:3])
-            (result.rotation.sum() + result.init.translation.sum()).backward()
-            grads.append([p.grad for p in net.parameters()])
-    for a, b in zip(*grads, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
+    for count in (50, 31, 1):
+        inputs = problems(count, n=6)[:3]
+        with torch.no_grad():
+            assert_same(compiled(*inputs), solver(*inputs), rtol=1e-6, atol=1e-8)
+    grads = []
+    for net in (solver, compiled):
+        result = net(*problems(50, n=6)[:3])
+        (result.rotation.sum() + result.init.translation.sum()).backward()
+        grads.append([p.grad for p in net.parameters()])
+    assert_same(*grads, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -273,11 +242,10 @@ def test_ranks_are_those_of_a_sort(batch, count, backend):
     ordered = values.sort(1).values
     ranks = torch.arange(batch) % (count + 1) - 1  # a negative rank means 0
     expected = ordered.gather(1, ranks.clamp(min=0).expand(3, 1, -1))[:, 0]
-    for sort in (in_order, Compiled(in_order)):
-        torch.testing.assert_close(sort(values), ordered)
-    for found in (ranked, Compiled(ranked)):
-        torch.testing.assert_close(found(values, count // 2), ordered[:, count // 2])
-        torch.testing.assert_close(found(values, ranks), expected)
+    for run in (Runner(), Runner(True)):
+        assert torch.equal(run(in_order, values), ordered)
+        assert torch.equal(run(ranked, values, count // 2), ordered[:, count // 2])
+        assert torch.equal(run(ranked, values, ranks), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -288,8 +256,8 @@ def test_ties_of_the_first_key_are_ordered_by_the_second_and_equal_pairs_stay(co
     keys[:, 0] *= -1.0  # -0 equals 0
     keys[:, -1] = torch.inf
     expected = [sorted(range(count), key=lambda i, pairs=pairs: pairs[i]) for pairs in keys.permute(2, 1, 0).tolist()]
-    for order in (ascending_order, Compiled(ascending_order)):
-        assert order(keys).tolist() == expected
+    for run in (Runner(), Runner(True)):
+        assert run(ascending_order, keys).tolist() == expected
 
 
 # --- operations as elementwise operations, in packages of one problem -------------------------------------------------
@@ -356,14 +324,9 @@ def test_a_forked_process_does_not_wait_for_a_thread_of_its_parent():
     thread = threading.Thread(target=hold)
     thread.start()
     held.wait()
-    process = multiprocessing.get_context("fork").Process(target=_take_a_turn)
+    process = multiprocessing.get_context("fork").Process(target=lambda: in_turn(torch.ones(1)).__enter__())
     process.start()
     process.join(30)
     done.set()
     thread.join()
     assert process.exitcode == 0
-
-
-def _take_a_turn() -> None:
-    with in_turn(torch.ones(1)):
-        pass

@@ -5,7 +5,7 @@ import torch
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-from kornia_pnpnet import Pose, PosePrior, create_solver, pose_covariance
+from kornia_pnpnet import PnPResult, Pose, PosePrior, create_solver, pose_covariance
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 
@@ -62,6 +62,23 @@ def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
     for part, freedom, tolerance in ((slice(0, 6), 6.0, 0.06), (slice(0, 3), 3.0, 0.1), (slice(3, 6), 3.0, 0.1)):
         squares = (error[:, part] * torch.linalg.solve(covariance[:, part, part], error[:, part])).sum(-1)
         assert squares.mean().item() == pytest.approx(freedom, rel=tolerance)
+
+
+@pytest.mark.parametrize(("n", "img_sigma", "world_sigma"), [(20, 1.0, 0.05), (50, 2.0, 0.0), (30, 0.0, 0.02)])
+def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sigma):
+    """Whether the pixels or the points have noise, as :func:`pose_covariance` of the true noise within a third."""
+    data = SyntheticProblems(
+        n=n, batch_size=500, seed=10, img_sigma=img_sigma, world_sigma=world_sigma, dtype=torch.float64
+    )
+    p = data.batch(0)
+    with torch.no_grad():
+        result = create_solver("pnpnet-set").double()(*p[:3])
+        covariance = result.covariance(*p[:3])
+    error = tangent(result.pose, p.pose)[result.ok]
+    squares = (error * torch.linalg.solve(covariance[result.ok], error)).sum(-1)
+    assert squares.mean().item() == pytest.approx(6.0, rel=0.33)
+    alone = PnPResult(*(x[0] if isinstance(x, torch.Tensor) else x for x in result))
+    torch.testing.assert_close(alone.covariance(*(x[0] for x in p[:3])), covariance[0])
 
 
 def test_gradients(make_problems):

@@ -45,14 +45,10 @@ def test_outliers_are_at_random_positions(n):
     assert (pairs - expected).abs().max() < 4.5 * math.sqrt(expected / COUNT)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
-def test_mismatches_have_their_share(share, generator):
-    found = OutlierMix(count=3, mismatch_share=share).draw(COUNT, 9, generator).flatten().bincount(minlength=3)
+def test_mismatches_have_their_share(generator):
+    found = OutlierMix(count=3, mismatch_share=0.2).draw(COUNT, 9, generator).flatten().bincount()
     assert found[OutlierKind.INLIER] == 6 * COUNT
-    if share == 0.2:
-        assert_counts(found[[OutlierKind.MISMATCH, OutlierKind.SENSING]], (share, 1 - share))
-    else:
-        assert found[OutlierKind.MISMATCH] == 3 * COUNT * share
+    assert_counts(found[[OutlierKind.MISMATCH, OutlierKind.SENSING]], (0.2, 0.8))
 
 
 def test_sensing_pixels_are_anywhere_in_the_image():

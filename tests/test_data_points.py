@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection, transform
+from data_helpers import COUNT, assert_normal, assert_uniform, draw, reprojection
 
-from kornia_pnpnet.data import BoxPoints, DrivePoints, FacadePoints, ObjectPoints, OutlierMix, RoomPoints, SlabPoints
+from kornia_pnpnet.data import DrivePoints, FacadePoints, ObjectPoints, OutlierMix, RoomPoints, SlabPoints
 
 VIEWS = [FacadePoints, RoomPoints, DrivePoints]
 
@@ -14,12 +14,6 @@ VIEWS = [FacadePoints, RoomPoints, DrivePoints]
 def thinness(points):
     values = torch.linalg.svdvals(points - points.mean(1, keepdim=True))
     return values[:, 2] / values[:, 0]
-
-
-def test_box(generator):
-    points = BoxPoints(half_width=1.0, z_near=5.0, depth=2.0)(COUNT, 3, generator)
-    assert_uniform(points[..., :2], -1, 1)
-    assert_uniform(points[..., 2], 5, 7)
 
 
 def test_slabs_are_in_view_and_in_front(generator):
@@ -46,7 +40,7 @@ def test_points_behind_the_camera_come_with_outliers():
         return ObjectPoints()(batch_size, n, generator) - torch.tensor([0.0, 0.0, 1.5])
 
     p = draw(9, 500, points=prior, world_sigma=0.0)
-    behind = transform(p.pose, p.world_points)[..., 2] <= 0
+    behind = p.true_cam_points[..., 2] <= 0
     assert behind.any()
     assert not p.inliers[behind].any()
     assert p.img_points.isfinite().all()
@@ -79,5 +73,5 @@ def test_surfaces_have_their_shapes(generator):
 @pytest.mark.parametrize("prior", VIEWS)
 def test_inliers_of_views_project_within_the_noise(prior):
     p = draw(30, 500, points=prior(), outliers=OutlierMix(max_ratio=0.95, crowd_share=0.5), world_sigma=0.0)
-    assert (transform(p.pose, p.world_points)[..., 2][p.inliers] > 0).all()
+    assert (p.true_cam_points[..., 2][p.inliers] > 0).all()
     assert_normal(reprojection(p)[p.inliers], 1.0)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from data_helpers import same
 
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems, VaryingSize
 from kornia_pnpnet.data.stream import stream_batches
 
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
@@ -35,6 +35,11 @@ def test_batches_are_those_of_the_source_in_order(workers, dtype):
     assert found == [True] * 21
     assert list(stream_batches(source, 3, 3, workers)) == []
     assert not multiprocessing.active_children()
+
+
+def test_workers_draw_batches_of_different_sizes():
+    source = VaryingSize(SyntheticProblems, n=[4, 7], batch_size=6, seed=3)
+    assert all(same(problems, source.batch(i)) for i, problems in enumerate(stream_batches(source, 0, 12, 1)))
 
 
 LEFT_OPEN = """

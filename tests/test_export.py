@@ -22,7 +22,7 @@ CPP = Path(__file__).resolve().parents[1] / "docs" / "examples" / "cpp"
 
 def inputs_of(problems, weights=None):
     weights = torch.ones_like(problems.world_points[..., 0]) if weights is None else weights
-    return tuple(x.float() for x in (problems.world_points, problems.img_points, problems.intrinsics, weights))
+    return tuple(x.float() for x in (*problems[:3], weights))
 
 
 def rigs(n, batch):
@@ -116,9 +116,8 @@ def test_onnx_of_an_unknown_focal_length(tmp_path):
     for n, batch in ((6, 7), (12, 50)):
         problems = CameraProblems(n=n, batch_size=batch, seed=5).batch(0)
         nominal = torch.where(torch.eye(3) > 0, 1.0, problems.intrinsics)
-        weights = torch.ones_like(problems.world_points[..., 0])
-        weights[0, 5:] = 0.0
-        inputs = [x.float() for x in (problems.world_points, problems.img_points, nominal, weights)]
+        inputs = inputs_of(problems._replace(intrinsics=nominal))
+        inputs[3][0, 5:] = 0.0
         *found, camera = run_onnx(path, inputs)
         near(found, solver, inputs)
         solver.effort = "fixed"
@@ -151,10 +150,13 @@ def test_solvers_that_the_command_cannot_export(tmp_path, capsys):
 
 @pytest.mark.parametrize(("name", "missing"), [("x.onnx", "onnx"), ("x.onnx", "onnxscript"), ("x.pt2", "compiler")])
 def test_what_an_export_needs_is_checked_before_it_starts(name, missing, tmp_path, monkeypatch, capsys):
+    export = export_package if missing == "compiler" else export_onnx
     if missing != "compiler":
         monkeypatch.setitem(sys.modules, missing, None)
     with torch._inductor.config.patch("cpp.cxx", ("no-such-compiler",)):
         assert main(["export", str(tmp_path / name)]) == 2
+        with pytest.raises(ImportError):
+            export(PnPNet(), tmp_path / name, 9)
     out, err = capsys.readouterr()
     assert out == ""
     assert "C++ compiler" in err if missing == "compiler" else "pip install '.[onnx]'" in err
@@ -215,10 +217,9 @@ def test_rigs(kind, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
 def test_cpp_example(make_problems, tmp_path):
     """The C++ program and Python get the same numbers from the same package."""
-    if shutil.which("cmake") is None:
-        pytest.skip("no cmake")
     path = packaged(tmp_path, PnPNet(None, RobustWeightedLM(1)), 9, batch=1)
     prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
     subprocess.run(["cmake", "-S", CPP, "-B", tmp_path / "build", prefix], check=True)
@@ -243,16 +244,9 @@ def test_cpp_example(make_problems, tmp_path):
     assert "n = 9" in refused.stderr
 
 
-def test_a_package_needs_its_suffix_and_a_compiler(tmp_path):
-    solver = PnPNet(None, RobustWeightedLM(1))
-    with pytest.raises(ValueCheckError, match=r"\.pt2"):
-        export_package(solver, tmp_path / "model.so", 9)
-    no_compiler = torch._inductor.config.patch("cpp.cxx", ("no-such-compiler",))
-    with no_compiler, pytest.raises(ImportError, match="compiler"):
-        export_package(solver, tmp_path / "model.pt2", 9)
-
-
 def test_files_that_are_no_packages(tmp_path):
+    with pytest.raises(ValueCheckError, match=r"\.pt2"):
+        export_package(PnPNet(), tmp_path / "model.so", 9)
     with pytest.raises(FileNotFoundError):
         load_package(tmp_path / "missing.pt2")
     path = tmp_path / "text.pt2"

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from helpers import assert_same
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
@@ -40,9 +41,7 @@ def train(folder, updates=40, resume=False, **changes):
 
 def assert_same_runs(folder, other):
     """The weights and the learning curves, except what depends on the clock."""
-    mine, theirs = (torch.load(x / CHECKPOINT_NAME, weights_only=True)["model"] for x in (folder, other))
-    assert mine.keys() == theirs.keys()
-    assert all(mine[key].equal(value) for key, value in theirs.items())
+    assert_same(*(torch.load(x / CHECKPOINT_NAME, weights_only=True)["model"] for x in (folder, other)))
     assert comparable(read_history(folder)) == comparable(read_history(other))
 
 
@@ -173,17 +172,11 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path):
     assert amid >= 3  # else the moments say nothing
 
 
-@pytest.fixture(scope="module")
-def weights_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("weights")
-    PnPNet(MLPInit(6), RobustWeightedLM(2)).save_pretrained(folder)
-    return folder
-
-
-def test_damaged_weights_load_nothing(weights_folder, tmp_path):
+def test_damaged_weights_load_nothing(tmp_path):
     """Damage gives an error, or changes neither the configuration nor the weights."""
-    files = {name: (weights_folder / name).read_bytes() for name in ("config.json", "model.safetensors")}
-    sound = PnPNet.from_pretrained(weights_folder)
+    PnPNet(MLPInit(6), RobustWeightedLM(2)).save_pretrained(tmp_path)
+    files = {name: (tmp_path / name).read_bytes() for name in ("config.json", "model.safetensors")}
+    sound = PnPNet.from_pretrained(tmp_path)
 
     @many(200)
     @given(st.sampled_from(sorted(files)), st.data())
@@ -195,7 +188,6 @@ def test_damaged_weights_load_nothing(weights_folder, tmp_path):
         except ValueCheckError:
             return
         assert json.dumps(loaded.config()) == json.dumps(sound.config())
-        theirs = loaded.state_dict()
-        assert all(theirs[key].equal(value) for key, value in sound.state_dict().items())
+        assert_same(loaded.state_dict(), sound.state_dict())
 
     run()

@@ -11,7 +11,6 @@ from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.conversions import (
     axis_angle_to_rotation_matrix,
     convert_points_from_homogeneous,
-    denormalize_points_with_intrinsics,
     rotation_matrix_to_axis_angle,
 )
 from kornia.geometry.liegroup import So3
@@ -76,17 +75,6 @@ def test_dehomogenising_with_zero_eps_divides_whatever_is_not_zero():
     points = torch.tensor([[2.0, 4.0, 2.0], [2e-20, 4e-20, 2e-20], [2.0, 4.0, -2.0], [2.0, 4.0, 0.0]])
     expected = torch.tensor([[1.0, 2.0], [1.0, 2.0], [-1.0, -2.0], [2.0, 4.0]])
     torch.testing.assert_close(convert_points_from_homogeneous(points, eps=0.0), expected)
-
-
-def test_intrinsics_broadcast_over_the_points_of_their_problem():
-    K = torch.eye(3).repeat(2, 1, 1)
-    K[0, 0, 0], K[1, 0, 0], K[0, 1, 1], K[1, 1, 1] = 2.0, 4.0, 8.0, 16.0
-    K[0, 0, 2], K[1, 1, 2] = 10.0, 20.0
-    pixels = torch.tensor([[[12.0, 8.0]] * 5, [[4.0, 36.0]] * 5])  # (B, N, 2)
-    plane_points = torch.ones(2, 5, 2)
-    torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points, K), pixels)
-    # As many points as problems: the letters must not be mixed up.
-    torch.testing.assert_close(denormalize_points_with_intrinsics(plane_points[:, :2], K), pixels[:, :2])
 
 
 # --- projection: ours is kornia's, in another layout and with a residual ----------------------------------------------

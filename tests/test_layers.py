@@ -27,11 +27,6 @@ LAYERS = (
     "cli",
 )
 
-#: What importing the package must not import: the extras, which a user of the layer need not have.
-EXTRAS = (
-    "cv2 hydra kornia_rs lightning_fabric matplotlib omegaconf pandas poselib pyarrow pycolmap pydantic ray seaborn"
-)
-
 #: Optional packages and the only modules that may import them.
 OWNERS = {
     "matplotlib": {"evaluation.plots"},
@@ -47,18 +42,14 @@ OWNERS = {
     "onnx_ir": {"export"},
     "onnxscript": {"export"},
 }
+#: What importing the package must not import: the extras, which a user of the layer need not have.
+EXTRAS = [*OWNERS, "lightning_fabric", "omegaconf", "seaborn"]
 
 
-def modules():
-    names = {}
-    for path in sorted(ROOT.rglob("*.py")):
-        parts = path.relative_to(ROOT).with_suffix("").parts
-        name = ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
-        names[name] = path
-    return names
-
-
-MODULES = modules()
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(ROOT.rglob("*.py"))
+}
 
 #: Methods for users may call a function of a higher layer: ``result.covariance(…)`` calls ``pose_covariance``.
 SHORTCUTS = {(MODULES["result"], "covariance")}
@@ -125,7 +116,7 @@ def test_importing_the_package_imports_no_extras_and_leaves_no_trace():
         "import kornia_pnpnet; after = (torch.get_rng_state(), torch.get_num_threads());"
         "assert torch.equal(before[0], after[0]) and before[1] == after[1];"
         "assert torch.get_default_dtype() == torch.float32;"
-        f"print([name for name in {EXTRAS.split()!r} if name in sys.modules])"
+        f"print([name for name in {EXTRAS!r} if name in sys.modules])"
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert output.stdout.strip() == "[]"

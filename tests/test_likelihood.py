@@ -142,11 +142,8 @@ def test_padding_and_bad_problems():
     assert not unknown[1:].any()
 
 
-def test_single_problems_and_half_precision():
+def test_half_precision():
     p = problems(n=20, batch=1)
-    alone = loss_of(p.map(lambda x: x[0]), img_sigma=2.0)
-    assert alone.shape == ()
-    torch.testing.assert_close(alone, loss_of(p, img_sigma=2.0)[0])
     half = p.world_points.bfloat16().requires_grad_()
     loss_of(p._replace(world_points=half), img_sigma=50.0).sum().backward()
     assert half.grad.isfinite().all()

@@ -169,3 +169,14 @@ def test_float32_and_errors_of_depth(seen):
         depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.1, img_sigma=1.0, img_cov=torch.zeros(2, 7, 2, 2))
     with pytest.raises(TypeCheckError, match="depth must be a tensor"):
         depth_points(pixels, 2.0, CAMERA, pose, depth_sigma=0.1)
+
+
+def test_a_matrix_that_is_no_rotation_is_replaced_by_the_nearest():
+    generator = torch.Generator().manual_seed(0)
+    pixels, depth = torch.rand(2, 5, 2, generator=generator), 1.0 + torch.rand(2, 5, generator=generator)
+    camera, here = torch.eye(3), Pose(torch.eye(3).expand(2, 3, 3), torch.ones(2, 3))
+    expected = depth_points(pixels, depth, camera, here, depth_sigma=0.1)
+    found = depth_points(pixels, depth, camera, here._replace(rotation=1.1 * here.rotation), depth_sigma=0.1)
+    torch.testing.assert_close(found, expected)
+    mirrored = depth_points(pixels, depth, camera, here._replace(rotation=-here.rotation), depth_sigma=0.1)
+    assert all(x.isnan().all() for x in mirrored)

@@ -97,3 +97,11 @@ def test_errors_of_any_numbers(value, dtype, random_rotations):
 def test_poses_that_do_not_fit_are_an_error(function, rotation, translation):
     with pytest.raises(BaseError):
         function(Pose(torch.zeros(rotation), torch.zeros(translation)), Pose(torch.zeros(2, 3, 3), torch.zeros(2, 3)))
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e30])
+def test_lengths_neither_overflow_nor_underflow(unit):
+    truth = Pose(torch.eye(3)[None], torch.zeros(1, 3))
+    estimate = Pose(torch.eye(3)[None], unit * torch.tensor([[3.0, 0.0, 4.0]]))
+    for lengths in (pose_errors(estimate, truth)[1], pose_distances(estimate, truth)[1]):
+        torch.testing.assert_close(lengths / unit, torch.tensor([5.0]))

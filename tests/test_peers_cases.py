@@ -57,39 +57,34 @@ def count(solver: nn.Module, p: Problems, limit: float, dtype: torch.dtype = tor
     return right(solve(solver, p, dtype), p, math.degrees(limit), limit)
 
 
-def opencv_poses(world: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """First of ten poses (rotation vector in (0.001, 1), depth in (0.01, 1)) that sees all points, or the last."""
-    vector, shift = torch.rand(2, len(world), 10, 3, generator=generator, dtype=torch.float64)
-    shift = shift * torch.tensor([2.0, 2, 0.99]) - torch.tensor([1.0, 1, -0.01])
-    rotation = axis_angle_to_rotation_matrix(1e-3 + 0.999 * vector.flatten(0, 1)).unflatten(0, (-1, 10))
-    seen = ((world[:, None] @ rotation.mT + shift[:, :, None])[..., 2] > 0).all(-1)
-    rows, chosen = torch.arange(len(world)), torch.where(seen.any(1), seen.int().argmax(1), 9)
-    return rotation[rows, chosen], shift[rows, chosen]
-
-
 def opencv_scenes(kind: str, n: int, seed: int, batch: int = 100) -> Problems:
     """Random clouds, planes in space or square tags; focal lengths and principal point in (0.001, 100) px.
 
     Points and pixels are rounded to float32, as in OpenCV's suite. Scenes with points behind the camera, which the
     suite keeps, are left out.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator, drawn = torch.Generator().manual_seed(seed), 40 * batch
 
     def uniform(*shape: int) -> Tensor:
-        return torch.rand(2 * batch, *shape, generator=generator, dtype=torch.float64)
+        return torch.rand(drawn, *shape, generator=generator, dtype=torch.float64)
+
+    def poses() -> tuple[Tensor, Tensor]:
+        """Rotation vectors in (0.001, 1) and depths in (0.01, 1)."""
+        shift = uniform(3) * torch.tensor([2.0, 2, 0.99]) - torch.tensor([1.0, 1, -0.01])
+        return axis_angle_to_rotation_matrix(1e-3 + 0.999 * uniform(3)), shift
 
     if kind == "cloud":
         world = torch.tensor([-1.0, -1, 5]) + uniform(n, 3) * torch.tensor([2.0, 2, 5])
     elif kind == "plane":
-        rotation, translation = opencv_poses(torch.zeros(2 * batch, 1, 3, dtype=torch.float64), generator)
+        rotation, translation = poses()
         world = (2.0 * uniform(n, 2) - 1.0) @ rotation[..., :2].mT + translation[:, None]
     else:
         corners = torch.tensor([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], dtype=torch.float64)
         world = corners * (0.01 + 0.99 * uniform(1, 1)) / 2
     world = world.float().double()
-    intrinsics = torch.eye(3, dtype=torch.float64).repeat(2 * batch, 1, 1)
+    intrinsics = torch.eye(3, dtype=torch.float64).repeat(drawn, 1, 1)
     intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = 1e-3 + 99.999 * uniform(4)
-    rotation, translation = opencv_poses(world, generator)
+    rotation, translation = poses()
     img = project(world, rotation, translation, intrinsics).float().double()
     seen = ((world @ rotation.mT + translation[:, None])[..., 2] > 0).all(-1).nonzero()[:batch, 0]
     assert len(seen) == batch
@@ -119,29 +114,6 @@ def test_opencv_scenes_with_outliers(kind, name, dtype):
     solver = create_solver(name, **({"threshold": 0.5} if name == "p3p-ransac" else {}))
     best = count(OpenCVRansac(threshold=0.5, iterations=500, confidence=0.99), p, 1e-2)
     assert count(solver, p, 1e-2, dtype) >= max(35, best - 1)
-
-
-@pytest.mark.parametrize("name", [*OURS, "reppnp-lm"])
-def test_opencv_double_support(name):
-    """OpenCV's ``double_support``: float32 and float64 agree on ten points of two lines and integer pixels.
-
-    The suite asks for 1e-3 of OpenCV, which computes both in float64. The camera is 700 units away, where half an ulp
-    of a float32 pixel (2^-16 px) moves the translation by up to 2e-3.
-    """
-    i = torch.arange(0, 10, 2, dtype=torch.float64)
-    lines = torch.stack((i, 0 * i, 0 * i), -1), torch.stack((i, i, i), -1)
-    world = torch.stack(lines, 1).flatten(0, 1)[None] + torch.tensor([5.0, 3, 2])
-    img = torch.stack((torch.stack((0 * i, i), -1), torch.stack((-i, i), -1)), 1).flatten(0, 1)[None]
-    camera = torch.tensor([[547.94130238, 0, 298.355457], [0, 548.177240027, 230.62194052], [0, 0, 1]]).double()
-    p = problems_of(world, img, camera, torch.eye(3)[None].double(), torch.zeros(1, 3).double())
-    single, double = (solve(create_solver(name), p, dtype) for dtype in (torch.float32, torch.float64))
-    with torch.no_grad():  # from so far away the mirror image is as likely
-        assert create_solver(name)(world, img, camera[None], alternatives=1).alternatives.probability[0, 0] > 0.4
-    assert not (single.ok | double.ok).any()
-    torch.testing.assert_close(single.rotation, double.rotation, rtol=0, atol=2e-5)
-    torch.testing.assert_close(single.translation, double.translation, rtol=2e-5, atol=0)
-    peer = solve(OpenCVRansac(threshold=8.0, iterations=100, confidence=0.999, method="P3P", refine=False), p)
-    assert (project(world, *double.pose, camera) - img).norm() < (project(world, *peer.pose, camera) - img).norm()
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "reppnp-lm", "epnp"])
@@ -236,10 +208,10 @@ def test_right_points_far_away(name, distance, dtype):
 
 @pytest.mark.parametrize("name", WILD)
 def test_skew_and_scale_of_the_camera(name, dtype):
-    """A skew of 1e-12 or 30 px whose pixels follow it, and twice the camera matrix, give the same pose."""
+    """A skew of 30 px whose pixels follow it, and twice the camera matrix, give the same pose."""
     solver, p = create_solver(name), protocol()
     expected = solve(solver, p, dtype)
-    for skew, factor in ((1e-12, 1.0), (30.0, 1.0), (0.0, 2.0)):
+    for skew, factor in ((30.0, 1.0), (0.0, 2.0)):
         camera, img = p.intrinsics.clone(), p.img_points.clone()
         camera[:, 0, 1] = skew
         img[..., 0] += skew * img[..., 1] / 3400.0

@@ -71,7 +71,7 @@ def test_neighbours_of_inliers_agree(generator):
 
 @pytest.mark.parametrize(("pairs", "size"), [(3, 3), (9, 7), (12, 4)])
 def test_enumeration_has_every_subset_once(pairs, size):
-    samples = Samples(torch.ones(2, pairs, dtype=torch.bool), size=size, most=1000, seed=0)
+    samples = Samples(torch.ones(2, pairs), size=size, most=1000, seed=0)
     total = math.comb(pairs, size)
     assert samples.totals.tolist() == [total, total]
     positions = samples.positions(torch.tensor([1, 0]), 0, total)
@@ -84,14 +84,14 @@ def test_enumeration_has_every_subset_once(pairs, size):
 def test_only_pairs_with_a_weight_are_drawn_independent_of_other_problems(generator):
     there = torch.rand(20, 30, generator=generator) < torch.linspace(0.2, 0.8, 20)[:, None]
     there[:, :3] = True
-    samples = Samples(there, size=3, most=200, seed=0)
+    samples = Samples(there.double(), size=3, most=200, seed=0)
     assert 0 < (samples.totals < 200).sum() < 20, "some are enumerated"
     problems = torch.arange(20)
     positions = samples.positions(problems, 0, 200)
     assert there[problems[:, None, None], positions].all()
     assert (positions.sort(-1).values.diff(dim=-1) > 0).all()
     for i in (0, 7, 19):
-        alone = Samples(there[i : i + 1, : 1 + int(there[i].nonzero().max())], size=3, most=200, seed=0)
+        alone = Samples(there[i : i + 1, : 1 + int(there[i].nonzero().max())].double(), size=3, most=200, seed=0)
         alone = alone.positions(torch.tensor([0]), 10, 90)
         assert torch.equal(alone, samples.positions(torch.tensor([19, i]), 10, 90)[1:]), "nor of padding"
 

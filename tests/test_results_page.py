@@ -50,6 +50,7 @@ def test_measurements_are_pooled_by_the_number_of_problems_and_by_what_the_solve
     peer = "poselib:threshold=6"
     first = {"pnpnet-set:effort=adaptive": (90, 80, 2.0), "pnpnet-set": (80, 60, 1.0), peer: (70, 70, 4.0)}
     second = {"pnpnet-set": (70, 60, 4.0), "pnpnet-set:effort=fixed": (60, 40, 1.0), peer: (70, 70, 8.0)}
+    second["pycolmap:threshold=8"] = (50, 50, 1.0)  # which the first file lacks
     pooled = matches.pool([matches_file(first), matches_file(second, (300, 100))])
     adaptive, fixed, other = pooled.values()  # in the order of the first file
     assert [adaptive[kind].success.rate for kind in ("few", "many", "all")] == [0.75, 0.75, 0.75]
@@ -57,11 +58,6 @@ def test_measurements_are_pooled_by_the_number_of_problems_and_by_what_the_solve
     assert (adaptive["all"].ms, fixed["few"].ms, other["all"].ms) == (3.0, 1.0, 6.0)
     assert adaptive["all"].success.total == 800
     assert matches.points_ahead(pooled) == pytest.approx(0.05)
-
-
-def test_a_solver_that_one_file_lacks_is_not_pooled():
-    both, one = {"pnpnet-set": (50, 50, 1.0)}, {"pnpnet-set": (50, 50, 1.0), "pycolmap:threshold=8": (50, 50, 1.0)}
-    assert len(matches.pool([matches_file(both), matches_file(one)])) == 1
 
 
 def test_a_solver_is_ahead_or_behind_only_when_intervals_are_apart():

@@ -20,7 +20,6 @@ from kornia_pnpnet import (
     Starts,
     Status,
     create_solver,
-    list_solvers,
     pose_errors,
     solve_pnp,
 )
@@ -374,11 +373,6 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
 def test_solvers_that_there_are_not_raise_an_error_that_names_what_is_wrong(make, message):
     with pytest.raises(BaseError, match=message):
         make()
-
-
-def test_solvers_have_sorted_names_and_are_in_evaluation_mode():
-    assert list_solvers() == sorted(list_solvers())
-    assert not create_solver("identity-lm", m=3).training
 
 
 class _Solved(Dataset):

@@ -1,6 +1,5 @@
 """``train.py`` and ``conf``: every configuration composes and trains; sweeps and resuming work from the shell."""
 
-import csv
 import json
 import logging
 import runpy
@@ -13,12 +12,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import assert_same
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from kornia_pnpnet import PnPNet
+from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.training.checkpoint import History
 from kornia_pnpnet.training.results import load_run
 
@@ -73,13 +74,16 @@ def test_every_data_config_trains(data, fit_config):
 
 
 def test_overrides_reach_the_parts():
-    config = composed("model.n=12", "model.m=3", "data.outliers.max_ratio=0.2", "batch_size=7", "seed=5")
-    solver = instantiate(config.model.solver)
-    data = instantiate(config.data.train)
+    """A sweep tests on other problems of the mix that it trains on."""
+    sizes = "model.n=12", "model.m=3", "data.outliers.max_ratio=0.2", "batch_size=7", "seed=5"
+    config = composed("experiment=sweep", *sizes)
+    solver, data = instantiate(config.model.solver), instantiate(config.data.train)
+    sets = {name: instantiate(source) for name, source in config.data.validation.items()}
     assert (solver.init.n, solver.refine.m) == (12, 3)
     assert data.batch_size == 7
-    assert {(source.n, source.seed, source.outliers.max_count(12)) for source in data.sources} == {(12, 5, 2)}
-    assert all(instantiate(source).n == 12 for source in config.data.validation.values())
+    assert {source.n for source in (*data.sources, *sets.values())} == {12}
+    assert {source.outliers.max_count(12) for source in (*data.sources, sets["uniform"])} == {2}
+    assert {source.seed for source in data.sources} == {5} != {sets["uniform"].seed}
 
 
 def test_a_typing_error_in_a_config_raises():
@@ -96,7 +100,7 @@ def test_run_writes_results_and_resumes(tmp_path, train):
     assert "train.updates=1" in results["overrides"]
     model = PnPNet.from_pretrained(tmp_path / "weights")
     checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)["model"]
-    assert all(torch.equal(value, checkpoint[name]) for name, value in model.state_dict().items())
+    assert_same(model.state_dict(), checkpoint)
 
     with pytest.raises(SystemExit) as again:
         train(f"hydra.run.dir={tmp_path}", "train.updates=1")
@@ -114,14 +118,13 @@ def test_run_starts_from_weights(tmp_path, train):
     options = (f"model.m={weights.refine.m}", f"model.solver.refine.kernel={kernel}", "weights=pnpnet-n9")
     options += ("model.solver.refine.robustness=null", f"model.views={weights.views}")
     train(f"hydra.run.dir={tmp_path / 'run'}", *options, *learn_nothing)
-    trained = PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict()
-    assert all(torch.equal(trained[name], value) for name, value in weights.state_dict().items())
+    assert_same(PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict(), weights.state_dict())
     lineage = load_run(tmp_path / "run" / "results.json").lineage()
     assert [entry.run.update for entry in lineage] == [200_000, 5000, 2000, 2]
     train(f"hydra.run.dir={tmp_path / 'again'}", *options, f"weights={tmp_path / 'run' / 'weights'}", "train.updates=3")
     collect_weights([tmp_path / "run", tmp_path / "again"], tmp_path / "mine")
-    with (tmp_path / "mine" / "history.csv").open(newline="") as file:
-        assert [row["update"] for row in csv.DictReader(file)] == ["1", "2", "3", "4", "5"]
+    history = read_csv(tmp_path / "mine" / "history.csv", ["update"]).values()
+    assert [row["update"] for row in history] == ["1", "2", "3", "4", "5"]
     card = (tmp_path / "mine" / "README.md").read_text()
     assert "\n# mine\n" in card
     assert card.count("`python train.py") == 5
@@ -130,8 +133,7 @@ def test_run_starts_from_weights(tmp_path, train):
     assert "only the network" in (tmp_path / "deeper" / "train.log").read_text()
     deeper = PnPNet.from_pretrained(tmp_path / "deeper" / "weights")
     assert deeper.refine.step().tolist() == pytest.approx([1.0] * (weights.refine.m + 1))
-    for a, b in zip(deeper.init.parameters(), weights.init.parameters(), strict=True):
-        assert torch.equal(a, b)
+    assert_same(list(deeper.init.parameters()), list(weights.init.parameters()))
     assert PnPNet.from_pretrained(tmp_path / "mine").config() == weights.config()
     for wrong in ("model.n=6", "weights=nowhere"):
         with pytest.raises(SystemExit, match="Cannot start"):
@@ -187,11 +189,16 @@ def test_compilation_changes_neither_the_numbers_nor_what_is_saved(tmp_path):
     assert "compile=" not in (tmp_path / "true" / "weights" / "README.md").read_text()
 
 
+@pytest.mark.slow
+def test_two_processes_train(tmp_path):
+    run(f"hydra.run.dir={tmp_path}", "engine=ddp_cpu")
+    assert load_run(tmp_path / "results.json").run.update == 2
+
+
 def test_sweep_leaves_results_and_a_summary(tmp_path, train, capsys):
     train("-m", "model.n=6,9", "model.m=0,2", "data.outliers.max_ratio=0.33", f"hydra.sweep.dir={tmp_path}")
     assert len(list(tmp_path.glob("*/results.json"))) == 4
-    with (tmp_path / "summary.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(read_csv(tmp_path / "summary.csv", ["run"]).values())
     assert {(row["model.n"], row["model.m"]) for row in rows} == {("6", "0"), ("6", "2"), ("9", "0"), ("9", "2")}
     table = capsys.readouterr().out
     for value in ("model.n", "model.m", "uniform", *(row["us_per_problem"] for row in rows)):
@@ -213,8 +220,8 @@ def test_sweeps_by_other_launchers(launcher, tmp_path):
     for _ in range(2):
         run(*command, f"hydra.sweep.dir={tmp_path}")
         assert len(list(tmp_path.glob("*/results.json"))) == 2
-        with (tmp_path / "summary.csv").open(newline="") as file:
-            assert {(row["model.n"], row["update"]) for row in csv.DictReader(file)} == {("6", "2"), ("9", "2")}
+        rows = read_csv(tmp_path / "summary.csv", ["run"]).values()
+        assert {(row["model.n"], row["update"]) for row in rows} == {("6", "2"), ("9", "2")}
     ends = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
     run(*command, f"hydra.sweep.dir={tmp_path}")
     assert ends == {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/last.ckpt")}
@@ -289,15 +296,3 @@ def test_what_an_ablation_trains(experiment, part, fit_config):
     settings = instantiate(config.train, _convert_="all")
     assert {settings.ramp_factor(update) for update in range(3)} == {1.0 if part == "refine" else 0.0}
     assert (solver.init is None) == (part == "refine")
-
-
-@pytest.mark.parametrize("max_ratio", swept("sweep")["data.outliers.max_ratio"])
-def test_sweep_tests_on_the_mix_it_trains_on(max_ratio):
-    config = composed("experiment=sweep", f"data.outliers.max_ratio={max_ratio}", "model.n=12", "model.m=2")
-    solver = instantiate(config.model.solver)
-    assert (solver.init.n, solver.refine.m) == (12, 2)
-    train, validation = (instantiate(source) for source in (config.data.train, config.data.validation.uniform))
-    sources = [*train.sources, validation]
-    most = {source.outliers.max_count(12) for source in sources}
-    assert most == {round(12 * float(max_ratio))}
-    assert len({source.seed for source in sources}) == 2

@@ -1,24 +1,24 @@
 """The training loop: resuming equals not stopping, bad steps are skipped, two processes equal one."""
 
-import csv
 import math
 import multiprocessing
 import os
 import re
 import signal
-import subprocess
 import sys
 import threading
 import time
 from copy import deepcopy
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers import assert_same
 from kornia.core.exceptions import BaseError
+from lightning_fabric import Fabric
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
+from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError
@@ -43,20 +43,13 @@ def make_parts(updates=6, **changes):
 
 
 def read_history(folder):
-    with (folder / HISTORY_NAME).open(newline="") as file:
-        return list(csv.DictReader(file))
+    return list(read_csv(folder / HISTORY_NAME, ["update"]).values())
 
 
 def comparable(rows):
     """History rows without what depends on the clock or the memory."""
     timed = ("updates_per_second", "peak_memory_mib", *SHARES)
     return [{k: v for k, v in row.items() if k not in timed} for row in rows]
-
-
-def assert_same_weights(model, other):
-    state = other.state_dict()
-    for name, value in model.state_dict().items():
-        assert torch.equal(value, state[name]), name
 
 
 class LossWith(PoseLoss):
@@ -90,28 +83,23 @@ def stopping_loss(at, number):
     [(signal.SIGTERM, 0, 0), (signal.SIGINT, 1, 0), (signal.SIGINT, 0, 1), (signal.SIGTERM, 1, 1)],
 )
 def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, workers_later):
+    if workers and sys.platform == "win32":
+        pytest.skip("os.kill ends the workers")
     whole = make_parts()
     fit(folder=tmp_path / "whole", **whole)
 
-    stopped = make_parts()
     handler = signal.getsignal(number)
-    if workers and sys.platform == "win32":
-        pytest.skip("os.kill ends the workers")
-    stopped["loss"] = stopping_loss(3, number)
+    stopped = {**make_parts(), "loss": stopping_loss(3, number)}
     report = fit(folder=tmp_path / "parts", data_workers=workers, **stopped)
     assert not multiprocessing.active_children()
-    assert report.interrupted
-    assert report.update == 3
+    assert (report.update, report.interrupted) == (3, True)
     assert signal.getsignal(number) is handler
     assert len(read_history(tmp_path / "parts")) == 3
 
-    torch.manual_seed(77)  # a fresh process: other weights at first
-    again = make_parts()
-    again["model"] = PnPNet(MLPInit(6), RobustWeightedLM(2))
+    again = {**make_parts(), "model": PnPNet(MLPInit(6), RobustWeightedLM(2))}  # other weights at first
     report = fit(folder=tmp_path / "parts", resume=True, data_workers=workers_later, **again)
-    assert not report.interrupted
-    assert report.update == 6
-    assert_same_weights(whole["model"], again["model"])
+    assert (report.update, report.interrupted) == (6, False)
+    assert_same(whole["model"].state_dict(), again["model"].state_dict())
     assert comparable(read_history(tmp_path / "parts")) == comparable(read_history(tmp_path / "whole"))
 
 
@@ -137,7 +125,7 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(tmp_path, value):
     before = deepcopy(parts["model"])
     report = fit(folder=tmp_path / "one", **{**parts, "loss": LossWith(lambda: value, at=(1,))})
     assert report.skipped == 1
-    assert_same_weights(parts["model"], before)
+    assert_same(parts["model"].state_dict(), before.state_dict())
 
     parts = make_parts(updates=5)
     report = fit(folder=tmp_path / "some", **{**parts, "loss": LossWith(lambda: value, at=(2, 4))})
@@ -236,26 +224,6 @@ def test_train_briefly(tmp_path):
     assert float(rows[-1]["val/none/success"]) > float(rows[0]["val/none/success"])
 
 
-DDP_SCRIPT = """
-import sys, torch
-sys.path.insert(0, {tests!r})
-from lightning_fabric import Fabric
-from test_training_loop import make_double
-from kornia_pnpnet.training import fit
-
-def train(fabric):
-    torch.set_num_threads(1)
-    fit(folder={folder!r}, fabric=fabric, **make_double())
-
-fabric = Fabric(accelerator="cpu", devices=2, strategy={strategy!r})
-if {strategy!r} == "ddp":
-    fabric.launch()
-    train(fabric)
-else:
-    fabric.launch(train)
-"""
-
-
 def make_double():
     parts = make_parts()
     parts["model"].double()
@@ -263,22 +231,20 @@ def make_double():
     return {**parts, "validation": {}}
 
 
-# A second process that is forked imports nothing anew.
+@forks
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
-@pytest.mark.parametrize("strategy", ["ddp_fork", pytest.param("ddp", marks=pytest.mark.slow)])
-def test_two_processes_equal_one(strategy, tmp_path):
+def test_two_processes_equal_one(tmp_path):
     """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
     one = make_double()
     start = deepcopy(one["model"].state_dict())
     fit(folder=tmp_path / "one", **one)
-    script = tmp_path / "run.py"
-    script.write_text(DDP_SCRIPT.format(tests=str(Path(__file__).parent), strategy=strategy, folder=str(tmp_path)))
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "distributed_backend=gloo" in done.stderr
+
+    def train(fabric):
+        fit(folder=tmp_path, fabric=fabric, **make_double())
+
+    Fabric(accelerator="cpu", devices=2, strategy="ddp_fork").launch(train)
     two = torch.load(tmp_path / CHECKPOINT_NAME, weights_only=True)["model"]
-    for name, value in one["model"].state_dict().items():
-        torch.testing.assert_close(two[name], value, rtol=0, atol=1e-9)
+    assert_same(two, one["model"].state_dict(), atol=1e-9)
     assert any(not torch.equal(two[name], start[name]) for name in start)
 
 
@@ -286,7 +252,7 @@ def test_validation_has_its_own_interval_and_does_not_change_the_training(tmp_pa
     one, other = make_parts(updates=9, log_every=4, validate_every=3), make_parts(updates=9, validate_every=100)
     fit(folder=tmp_path, **one)
     fit(folder=tmp_path / "other", **other)
-    assert_same_weights(one["model"], other["model"])
+    assert_same(one["model"].state_dict(), other["model"].state_dict())
     rows = read_history(tmp_path)
     assert [row["update"] for row in rows] == ["3", "4", "6", "8", "9"]
     assert [row["update"] for row in rows if row["val/none/success"]] == ["3", "6", "9"]
@@ -299,20 +265,17 @@ def test_a_signal_in_the_last_update_is_no_interruption(tmp_path):
 
 class SlowSource(SyntheticProblems):
     def batch(self, index):
-        time.sleep(0.2)
+        time.sleep(0.5)
         return super().batch(index)
 
 
 def test_shares_of_the_time_add_up_and_show_slow_data(tmp_path):
-    quick, slow = ({**make_parts(), "data": kind(n=6, batch_size=16)} for kind in (SyntheticProblems, SlowSource))
-    shares = [fit(folder=tmp_path / name, **parts).time_shares for name, parts in (("quick", quick), ("slow", slow))]
-    assert [f"{stage}_share" for stage in shares[0]] == SHARES
-    rows = [[float(row[share]) for share in SHARES] for row in read_history(tmp_path / "quick")]
-    for values in (*(entry.values() for entry in shares), *rows):
-        assert all(value > 0.0 for value in values)
+    shares = fit(folder=tmp_path, **{**make_parts(), "data": SlowSource(n=6, batch_size=16)}).time_shares
+    assert shares["data"] == max(shares.values())
+    for row in ({f"{stage}_share": x for stage, x in shares.items()}, *read_history(tmp_path)):
+        values = [float(row[share]) for share in SHARES]
+        assert min(values) > 0.0
         assert sum(values) == pytest.approx(1.0, abs=1e-4)  # six digits are written
-    assert shares[1]["data"] > shares[0]["data"]
-    assert shares[1]["data"] == max(shares[1].values())
 
 
 @pytest.mark.parametrize(("batch_size", "processes"), [(15, 2), (2, 4)])

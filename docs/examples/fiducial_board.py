@@ -63,7 +63,6 @@ def mislabelled(numbers: np.ndarray, share: float, rng: np.random.Generator) -> 
 
 
 def main() -> None:
-    """Draw, detect, solve, and write what came out."""
     parser = command(__doc__)
     parser.add_argument("--frames", type=int, default=60)
     options = parser.parse_args()
@@ -92,14 +91,13 @@ def main() -> None:
         for name, solver in solvers.items():
             with torch.no_grad():
                 result = solver(world, img, torch.from_numpy(CAMERA), mask=mask)
-            pose = result.pose
-            away, angle = pose_error(pose, truth)
+            away, angle = pose_error(result.pose, truth)
             runs[name][f"{share:.0%}"] = {
                 "median_mm": 1000.0 * away[result.ok].median().item(),
                 "median_deg": angle[result.ok].median().item(),
                 "within_10_mm": (result.ok & (away < 0.01)).double().mean().item(),
             }
-            paths[name] = centre(pose)
+            paths[name] = centre(result.pose)
     write(options.out / "fiducial_board.json", frames=len(seen), runs=runs)
     figure = make_figure(8.6, 3.4)
     left, right = figure.subplots(1, 2)
@@ -110,11 +108,9 @@ def main() -> None:
     right.plot(*centres[:, :2].T, color="black", linewidth=0.8, label="true path")
     for (name, found), colour, mark in zip(paths.items(), (BLUE, ORANGE), ("o", "x"), strict=True):
         right.plot(*found[:, :2].mT, mark, color=colour, markersize=4, fillstyle="none", linestyle="none", label=name)
-    span = 1.3 * np.abs(centres[:, :2] - centres[:, :2].mean(0)).max()
-    middle = centres[:, :2].mean(0)
-    right.set(xlim=(middle[0] - span, middle[0] + span), ylim=(middle[1] - span, middle[1] + span))
-    right.set(xlabel="x (m)", ylabel="y (m)")
-    right.set_aspect("equal")
+    x, y = centres[:, :2].mean(0)
+    span = 1.3 * np.abs(centres[:, :2] - (x, y)).max()
+    right.set(xlim=(x - span, x + span), ylim=(y - span, y + span), xlabel="x (m)", ylabel="y (m)", aspect="equal")
     right.set_title(f"path of the camera, {100 * SHARES[-1]:.0f} % mislabelled", loc="left")
     right.legend(frameon=False, fontsize=7)
     right.grid(color="#dddddd")

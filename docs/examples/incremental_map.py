@@ -9,7 +9,6 @@ the end all images are registered again to the whole map. Writes `incremental_ma
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -26,11 +25,10 @@ CAMERA = torch.tensor([[1000.0, 0.0, 640.0], [0.0, 1000.0, 480.0], [0.0, 0.0, 1.
 PIXEL_NOISE, THRESHOLD = 1.0, 6.0  # px
 SEED = 20_261_123
 
-#: By name the solver that registers images, from world points (B, N, 3), pixels (B, N, 2), the camera and a mask of the
-#: matches. Shorter lists of matches are padded.
-REGISTER: dict[str, Callable[[], nn.Module]] = {
-    "cv2.solvePnPRansac": lambda: opencv(THRESHOLD),
-    "pnpnet-set": lambda: create_solver("pnpnet-set"),
+#: What registers images, from world points (B, N, 3), pixels (B, N, 2), the camera and a mask of the matches.
+REGISTER: dict[str, nn.Module] = {
+    "cv2.solvePnPRansac": opencv(THRESHOLD),
+    "pnpnet-set": create_solver("pnpnet-set"),
 }
 
 
@@ -44,17 +42,11 @@ def draw_scene(wrong: float, index: int) -> tuple[Pose, Tensor]:
     none = torch.zeros(IMAGES, 3, dtype=torch.float64)
     rotation = Pose.from_rvec(tilt.expand(IMAGES, 3), none).rotation @ Pose.from_rvec(turn, none).rotation
     poses = Pose(rotation, torch.tensor([0.0, 0.0, 15.0], dtype=torch.float64).expand(IMAGES, 3))
-    pixels = project(poses, points.expand(IMAGES, -1, -1))
+    pixels = poses.camera(CAMERA).project(points.expand(IMAGES, -1, -1))
     pixels = pixels + PIXEL_NOISE * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     other = torch.rand(IMAGES, POINTS, generator=generator).argsort(-1)
     mismatch = torch.rand(IMAGES, POINTS, generator=generator) < wrong
     return poses, torch.where(mismatch[..., None], pixels.gather(1, other[..., None].expand(-1, -1, 2)), pixels)
-
-
-def project(pose: Pose, points: Tensor) -> Tensor:
-    """Pixels of world points."""
-    cam = (points @ pose.rotation.mT + pose.translation[:, None]) @ CAMERA.mT
-    return cam[..., :2] / cam[..., 2:]
 
 
 @torch.no_grad()
@@ -80,7 +72,6 @@ def run(solver: nn.Module, truth: Pose, pixels: Tensor) -> tuple[Pose, float]:
 
 
 def main() -> None:
-    """Map scenes with both libraries and write what came out."""
     parser = command(__doc__)
     parser.add_argument("--scenes", type=int, default=20)
     options = parser.parse_args()
@@ -88,8 +79,8 @@ def main() -> None:
     cv2.setNumThreads(1)
     runs: dict[str, Any] = {name: {} for name in REGISTER}
     for wrong in (0.05, 0.1, 0.2):
-        for name, make in REGISTER.items():
-            solver, errors, seconds = make(), [], []
+        for name, solver in REGISTER.items():
+            errors, seconds = [], []
             for index in range(options.scenes):
                 truth, pixels = draw_scene(wrong, index)
                 poses, spent = run(solver, truth, pixels)

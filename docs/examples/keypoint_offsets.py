@@ -47,11 +47,11 @@ def kornias_dlt(*inputs: Tensor) -> tuple[Pose, Tensor]:
     return pose, pose.matrix.detach().isfinite().all(-1).all(-1)
 
 
-SOLVERS: dict[str, Callable[[], Solve]] = {
+SOLVERS: dict[str, Solve] = {
     # The noise includes the bias. Otherwise biased keypoints would be outliers with hardly any gradient.
-    "pnpnet-set": lambda: ours("pnpnet-set", img_sigma=BIAS, world_sigma=0.0),
-    "epnp": lambda: ours("epnp"),
-    "kornia-dlt": lambda: kornias_dlt,
+    "pnpnet-set": ours("pnpnet-set", img_sigma=BIAS, world_sigma=0.0),
+    "epnp": ours("epnp"),
+    "kornia-dlt": kornias_dlt,
 }
 COLOURS = dict(zip(SOLVERS, (BLUE, ORANGE, GREEN), strict=True))
 
@@ -116,12 +116,11 @@ def plot(runs: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    """Learn with every solver, write the results and draw them."""
     parser = command(__doc__)
     parser.add_argument("--steps", type=int, default=600)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    runs = {name: learn(make(), options.steps) for name, make in SOLVERS.items()}
+    runs = {name: learn(solve, options.steps) for name, solve in SOLVERS.items()}
     write(options.out / "keypoint_offsets.json", steps=options.steps, runs=runs)
     plot(runs, options.out / "keypoint_offsets.png")
     for name, run in runs.items():

@@ -157,12 +157,11 @@ class Keypoints(nn.Module):
         super().__init__()
         count = len(KEYPOINTS)
 
-        def block(size_in: int, size_out: int, kernel: int | None = None) -> nn.Sequential:
-            """A layer that halves the size if ``kernel`` is given."""
-            layer = nn.Conv2d(size_in, size_out, kernel or 3, 2 if kernel else 1, (kernel or 3) // 2, bias=False)
+        def block(size_in: int, size_out: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+            layer = nn.Conv2d(size_in, size_out, kernel, stride, kernel // 2, bias=False)
             return nn.Sequential(layer, nn.GroupNorm(8, size_out), nn.ReLU())
 
-        self.down = nn.ModuleList([block(3, 24, 5), block(24, 48, 3), block(48, 96, 3), block(96, 96, 3)])
+        self.down = nn.ModuleList([block(3, 24, 5, 2), block(24, 48, 3, 2), block(48, 96, 3, 2), block(96, 96, 3, 2)])
         self.up = nn.ModuleList([block(96 + 96, 64), block(64 + 48, 48), block(48 + 24, 48)])
         self.heads = nn.Conv2d(48, 2 * count, 1)
         self.noise = SIGMA
@@ -277,9 +276,13 @@ def test(network: Keypoints, solver: nn.Module, *, with_sigma: bool, batches: in
         off = (pixels - problem.pixels).norm(dim=-1).mean(-1)
         rows.append(torch.stack((distance(pose, problem.pose), pose_error(pose, problem.pose)[1], off)))
     away, angle, pixel = torch.cat(rows, 1)
-    means = {"mean_distance": away.clamp(max=1.0).mean(), "mean_rotation_deg": angle.mean()}
-    medians = {"median_distance": away.median(), "median_rotation_deg": angle.median()}
-    return {name: x.item() for name, x in {**means, **medians, "mean_keypoint_px": pixel.mean()}.items()}
+    return {
+        "mean_distance": away.clamp(max=1.0).mean().item(),
+        "mean_rotation_deg": angle.mean().item(),
+        "median_distance": away.median().item(),
+        "median_rotation_deg": angle.median().item(),
+        "mean_keypoint_px": pixel.mean().item(),
+    }
 
 
 def begin(seed: int, updates: int, *, motion: bool, **options: Any) -> tuple[nn.Module, Keypoints, Keypoints, Any]:
@@ -309,7 +312,7 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     return found, {name: networks[name] for name in (ALONE, END)}
 
 
-def run_covariances(seed: int, updates: int, batches: int) -> dict[str, Any]:
+def run_covariances(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str, Keypoints]]:
     """Train networks that predict each kind of noise from one start, on images with motion blur."""
     solver, _, start, found = begin(seed, updates, motion=True)
     more = range(updates, updates + updates // 2)
@@ -318,7 +321,7 @@ def run_covariances(seed: int, updates: int, batches: int) -> dict[str, Any]:
         curves = train(network, solver, seed, more, end_to_end=True, likelihood=True, motion=True)
         found[noise] = {"curves": curves, **test(network, solver, with_sigma=True, batches=batches, motion=True)}
         print(f"seed {seed}, {noise}: mean_distance {found[noise]['mean_distance']:.4f}", flush=True)
-    return found
+    return found, {}
 
 
 @themed
@@ -373,7 +376,6 @@ def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) ->
 
 
 def main() -> None:
-    """Train with every seed, write the results and draw them."""
     parser = command(__doc__)
     parser.add_argument("--updates", type=int, default=2000, help="of each half of the training")
     parser.add_argument("--seeds", type=int, default=3)
@@ -382,23 +384,19 @@ def main() -> None:
     parser.add_argument("--covariances", action="store_true", help="compare kinds of noise; end to end half as long")
     options = parser.parse_args()
     arguments = range(options.seeds), repeat(options.updates), repeat(options.batches)
-    made = {"updates": options.updates, "batches": options.batches}
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
         runs = list(pool.map(run_covariances if options.covariances else run, *arguments))
-    if options.covariances:
-        seeds = {str(seed): found for seed, found in enumerate(runs)}
-        write(options.out / "keypoint_covariances.json", **made, seeds=seeds)
-        return
     seeds = {str(seed): found for seed, (found, _) in enumerate(runs)}
-    sums = {
-        name: {key: sum(x[name][key] for x in seeds.values()) for key in seeds["0"][WITHOUT_SIGMA]} for name in WAYS
-    }
-    times_lower = {
-        name: {key: total / sums[END][key] for key, total in of_way.items()}
-        for name, of_way in sums.items()
-        if name != END
-    }
-    results = {**made, "times_lower": times_lower, "seeds": seeds}
+    results: dict[str, Any] = {"updates": options.updates, "batches": options.batches, "seeds": seeds}
+    if options.covariances:
+        write(options.out / "keypoint_covariances.json", **results)
+        return
+
+    def total(name: str, key: str) -> float:
+        return sum(found[name][key] for found in seeds.values())
+
+    keys, others = seeds["0"][WITHOUT_SIGMA], (name for name in WAYS if name != END)
+    results["times_lower"] = {name: {key: total(name, key) / total(END, key) for key in keys} for name in others}
     write(options.out / "keypoint_pipeline.json", **results)
     plot_errors(results, options.out / "keypoint_pipeline.png")
     plot_overlays(runs[-1][1], options.out / "keypoint_pipeline_overlays.png")

@@ -42,6 +42,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.evaluation.plots import BLUE, make_figure, save, themed
 
 LONGEST = 1600  # pixels; larger images are shrunk for the features
@@ -197,47 +198,40 @@ def choose(matches: Matches, calibration: IsotonicRegression) -> tuple[Matches, 
 
 
 def solve(
-    solver: nn.Module, photos: Sequence[Photo], matches: Sequence[Matches], confidences: Sequence[Tensor]
+    solver: nn.Module, photos: Sequence[Photo], matches: Sequence[Matches], confidences: Sequence[Tensor], batch: int
 ) -> PnPResult:
-    """Solve a batch of queries with one call."""
-    world, img, confidence = (
-        pad_sequence(list(x), batch_first=True)
-        for x in ([m.world_points for m in matches], [m.img_points for m in matches], confidences)
-    )
-    mask = pad_sequence([torch.ones_like(c, dtype=torch.bool) for c in confidences], batch_first=True)
-    intrinsics = torch.stack([photo.intrinsics for photo in photos])
+    """Solve queries in batches, padded to the same number of pairs."""
+    masks = [torch.ones_like(x, dtype=torch.bool) for x in confidences]
+    lists = [m.world_points for m in matches], [m.img_points for m in matches], masks, confidences
+    world, img, mask, confidence = (pad_sequence(list(x), batch_first=True) for x in lists)
+    inputs = world, img, torch.stack([photo.intrinsics for photo in photos]), mask, confidence
     with torch.no_grad():
-        result: PnPResult = solver(world, img, intrinsics, mask=mask, confidence=confidence)
-    return result
+        parts = zip(*(x.split(batch) for x in inputs), strict=True)
+        results = [solver(*pairs, mask=mask, confidence=confidence) for *pairs, mask, confidence in parts]
+    return map_tensors(lambda *x: torch.cat(x), *results)
 
 
-def found_poses(result: PnPResult) -> list[Pose | None]:
-    """The pose of each problem, None where it is not ok."""
-    return [Pose(*x) if ok else None for *x, ok in zip(*result.pose, result.ok, strict=True)]
-
-
-def solve_by_colmap(photo: Photo, matches: Matches) -> Pose | None:
-    """COLMAP's estimator as hloc calls it: a threshold of 12 px and default options."""
-    (fx, _, cx), (_, fy, cy), _ = photo.intrinsics.tolist()
-    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[fx, fy, cx, cy])
+def solve_by_colmap(photos: Sequence[Photo], matches: Sequence[Matches]) -> tuple[Pose, Tensor]:
+    """COLMAP's estimator as hloc calls it: a threshold of 12 px and default options. Poses, and which were found."""
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = 12.0
     options.ransac.random_seed = 0
-    found = pycolmap.estimate_and_refine_absolute_pose(
-        matches.img_points.numpy(), matches.world_points.numpy(), camera, options
-    )
-    if found is None:
-        return None
-    matrix = torch.from_numpy(found["cam_from_world"].matrix())
-    return Pose(matrix[:, :3], matrix[:, 3])
+    found = []
+    for photo, pairs in zip(photos, matches, strict=True):
+        (fx, _, cx), (_, fy, cy), _ = photo.intrinsics.tolist()
+        camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[fx, fy, cx, cy])
+        points = pairs.img_points.numpy(), pairs.world_points.numpy()
+        found.append(pycolmap.estimate_and_refine_absolute_pose(*points, camera, options))
+    matrices = torch.tensor(np.array([x["cam_from_world"].matrix() if x else np.eye(3, 4) for x in found]))
+    return Pose(matrices[..., :3], matrices[..., 3]), torch.tensor([x is not None for x in found])
 
 
-def error_of(found: Pose | None, truth: Pose, metre: float) -> dict[str, Any] | None:
+def errors(pose: Pose, found: Tensor, photos: Sequence[Photo], metre: float) -> list[dict[str, float] | None]:
     """Distance of the cameras in metres and angle of the rotations in degrees; None without a pose."""
-    if found is None:
-        return None
-    distance, angle = pose_error(found, truth)
-    return {"metres": distance.item() * metre, "degrees": angle.item()}
+    truth = Pose(*(torch.stack(x) for x in zip(*(photo.pose for photo in photos), strict=True)))
+    distance, angle = pose_error(pose, truth)
+    rows = zip((distance * metre).tolist(), angle.tolist(), found.tolist(), strict=True)
+    return [{"metres": metres, "degrees": degrees} if there else None for metres, degrees, there in rows]
 
 
 def summary(errors: Sequence[dict[str, Any] | None], ms: float) -> dict[str, Any]:
@@ -281,34 +275,31 @@ def run(
     chosen = [choose(x, calibration) for x in matched]
     lap("confidence")
     kept, confidences = (list(x) for x in zip(*chosen, strict=True))
-    groups = [slice(i, i + batch) for i in range(0, len(photos), batch)]
-    solve(solver, photos[:1], kept[:1], confidences[:1])  # the first call of a process takes longer
+    solve(solver, photos[:1], kept[:1], confidences[:1], batch)  # the first call of a process takes longer
     lap("preparation")
-    results = [solve(solver, photos[x], kept[x], confidences[x]) for x in groups]
+    result = solve(solver, photos, kept, confidences, batch)
     lap(OURS)
-    poses: dict[str, list[Pose | None]] = {OURS: [pose for result in results for pose in found_poses(result)]}
+    found = {OURS: errors(result.pose, result.ok, photos, metre)}
     theirs = {"pycolmap, the same pairs": kept}
     if isinstance(detector, Sift):
         theirs["pycolmap, ratio test"] = [Matches(*(x[m.scores < RATIO_TEST] for x in m)) for m in matched]
     theirs["pycolmap, all matches"] = matched
     for name, pairs in theirs.items():
-        clock = time.process_time()
-        poses[name] = [solve_by_colmap(x, matches) for x, matches in zip(photos, pairs, strict=True)]
+        lap("errors")
+        poses = solve_by_colmap(photos, pairs)
         lap(name)
+        found[name] = errors(*poses, photos, metre)
 
-    inliers = [mask for result in results for mask in result.inliers]
     rows, drawn = [], []
     for i, photo in enumerate(photos):
-        error = errors_px(kept[i], photo)
-        row: dict[str, Any] = {"image": photo.name, "matches": len(matched[i].scores), "pairs": len(error)}
-        row["outliers"] = (error > INLIER_PX).double().mean().item()
-        row["outliers_of_all"] = (errors_px(matched[i], photo) > INLIER_PX).double().mean().item()
-        row |= {name: error_of(found[i], photo.pose, metre) for name, found in poses.items()}
-        rows.append(row)
-        drawn.append((kept[i], inliers[i][: len(error)], row))
+        outlier, of_all = (errors_px(x[i], photo) > INLIER_PX for x in (kept, matched))
+        row: dict[str, Any] = {"image": photo.name, "matches": len(of_all), "pairs": len(outlier)}
+        row |= {"outliers": outlier.double().mean().item(), "outliers_of_all": of_all.double().mean().item()}
+        rows.append(row | {name: of_queries[i] for name, of_queries in found.items()})
+        drawn.append((kept[i], result.inliers[i, : len(outlier)], rows[-1]))
     ms = {stage: 1000.0 * x / len(photos) for stage, x in seconds.items()}
     stages = {stage: ms[stage] for stage in ("features", "retrieval", "matching", "confidence")}
-    solvers = {name: summary([row[name] for row in rows], ms[name]) for name in poses}
+    solvers = {name: summary(x, ms[name]) for name, x in found.items()}
     settings = {"references": len(references), "matched_with": REFERENCES, "pairs": MOST_PAIRS, "batch": batch}
     return {"settings": settings, "limits": LIMITS, "images": rows, "stages_ms": stages, "solvers": solvers}, drawn
 
@@ -332,7 +323,6 @@ def draw(drawn: Sequence[tuple[Matches, Tensor, dict[str, Any]]], images: Path, 
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Localise, write the results and draw."""
     parser = command(__doc__)
     parser.add_argument("--images", type=Path, help="folder of the images")
     parser.add_argument("--model", type=Path, help="folder of the COLMAP model, text or binary")

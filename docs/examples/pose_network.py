@@ -96,7 +96,6 @@ def train(steps: int, seed: int) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Train, and write the curves."""
     parser = command(__doc__)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=1)

@@ -51,7 +51,6 @@ def solve(
 
 
 def main() -> None:
-    """Read the arguments and solve."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", metavar="IN")
     parser.add_argument("out", metavar="OUT")

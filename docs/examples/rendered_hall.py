@@ -7,7 +7,6 @@ pixel is (0.5, 0.5)).
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,9 +15,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pycolmap
+import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from kornia_pnpnet import Pose, depth_points
 
 Floats = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
@@ -30,9 +30,7 @@ SIZE = np.array([12.0, 9.0, 4.0])  # of the hall, in metres
 TEXELS = 100  # of a texture on a metre
 SUPERSAMPLING = 2  # rays across a pixel
 MAX_DEPTH = 8.0  # metres, of the depth images
-# Points of the map: number of features of an image, Lowe's ratio, smallest angle between rays and largest error of a
-# ray in degrees.
-FEATURES, RATIO, MIN_ANGLE, MAX_ERROR = 1500, 0.8, 1.5, 0.25
+FEATURES = 1500  # of an image of the map
 
 
 class View(NamedTuple):
@@ -177,29 +175,37 @@ def query_views(hall: list[Plane], count: int, seed: int = 2) -> Iterator[View]:
 def make_scene(folder: Path, references: int = 20, queries: int = 60, seed: int = 0) -> Path:
     """Write a folder of images and a COLMAP text model of them, as COLMAP leaves it: `images` and `sparse`.
 
-    The model's points are triangulated from SIFT matches of the reference images (`reference00.png` and so on); the
-    queries (`query00.png` and so on) only have poses.
+    The model's points are SIFT features of the reference images (`reference00.png` and so on) with their depths;
+    the queries (`query00.png` and so on) only have poses.
     """
-    hall = make_hall(seed)
+    hall, sift = make_hall(seed), cv2.SIFT_create(nfeatures=FEATURES, enable_precise_upscale=True)
     views = {f"reference{i:02}.png": view for i, view in enumerate(reference_views(hall, references))}
-    keypoints, points = triangulate(list(views.values()))
     views |= {f"query{i:02}.png": view for i, view in enumerate(query_views(hall, queries))}
     for name in ("images", "sparse"):
         (folder / name).mkdir(parents=True)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(CAMERA)
-    for i, (name, view) in enumerate(views.items()):
+    for i, (name, view) in enumerate(views.items(), start=1):
         cv2.imwrite(str(folder / "images" / name), view.image)
-        found = keypoints[i] if i < references else np.zeros((0, 2))
-        image = pycolmap.Image(name=name, keypoints=found, camera_id=1, image_id=i + 1)
+        found = sift.detect(view.image) if i <= references else []
+        keypoints = np.array([x.pt for x in found], dtype=np.float64).reshape(-1, 2) + 0.5
+        image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=1, image_id=i)
         model.add_image_with_trivial_frame(image, rigid(view.rotation, view.translation))
-    for point, fitting in points:
-        track = pycolmap.Track()
-        for i, keypoint in fitting:
-            track.add_element(i + 1, keypoint)
-        model.add_point3D(point, track)
+        points = seen_points(view, keypoints)
+        for k in np.flatnonzero(np.isfinite(points[:, 0])):
+            track = pycolmap.Track()
+            track.add_element(i, k)
+            model.add_point3D(points[k], track)
     model.write_text(folder / "sparse")
     return folder
+
+
+def seen_points(view: View, pixels: Floats) -> Floats:
+    """The points (K, 3) of the hall in pixels (K, 2) of a view, NaN where there is nothing."""
+    columns, rows = pixels.astype(int).T
+    tensors = map(torch.from_numpy, (pixels, view.depth[rows, columns], INTRINSICS, view.rotation, view.translation))
+    img_points, depth, intrinsics, *pose = tensors
+    return depth_points(img_points, depth, intrinsics, Pose(*pose), depth_sigma=0.0)[0].numpy()
 
 
 def depth_sigma(depth: Any) -> Any:
@@ -242,41 +248,3 @@ def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
 def rigid(rotation: Floats, translation: Floats) -> pycolmap.Rigid3d:
     """A pose of pycolmap."""
     return pycolmap.Rigid3d(np.column_stack((rotation, translation)))
-
-
-def triangulate(views: list[View]) -> tuple[list[Floats], list[tuple[Floats, list[tuple[int, int]]]]]:
-    """Keypoints (K, 2) of views with known poses, and points from their matches.
-
-    Each point (3,) comes with its track: pairs of the number of a view and the number of a keypoint.
-    """
-    sift = cv2.SIFT_create(nfeatures=FEATURES, enable_precise_upscale=True)
-    found = [sift.detectAndCompute(view.image, None) for view in views]
-    keypoints = [np.array([x.pt for x in points], dtype=np.float64) + 0.5 for points, _ in found]
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    starts = np.cumsum([0, *map(len, keypoints)])  # number of the first keypoint of each view, over all views
-    ends = []
-    for i, j in itertools.combinations(range(len(views)), 2):
-        back = {x.queryIdx: x.trainIdx for x in matcher.match(found[j][1], found[i][1])}
-        for first, second in matcher.knnMatch(found[i][1], found[j][1], k=2):
-            if first.distance < RATIO * second.distance and back[first.trainIdx] == first.queryIdx:
-                ends.append((starts[i] + first.queryIdx, starts[j] + first.trainIdx))
-    one, other = np.array(ends).T
-    matches = coo_array((np.ones(len(one)), (one, other)), shape=(starts[-1], starts[-1]))
-    _, labels = connected_components(matches, directed=False)
-    groups: dict[int, list[tuple[int, int]]] = {}
-    for i, (start, end) in enumerate(itertools.pairwise(starts)):
-        for keypoint, label in enumerate(labels[start:end].tolist()):
-            groups.setdefault(label, []).append((i, keypoint))
-    poses = [rigid(view.rotation, view.translation) for view in views]
-    options = pycolmap.EstimateTriangulationOptions(min_tri_angle=math.radians(MIN_ANGLE))
-    options.ransac.max_error = math.radians(MAX_ERROR)
-    options.ransac.random_seed = 0
-    points = []
-    for group in groups.values():
-        if len(group) > 1:
-            pixels = np.array([keypoints[i][keypoint] for i, keypoint in group])
-            made = pycolmap.estimate_triangulation(pixels, [poses[i] for i, _ in group], [CAMERA] * len(group), options)
-            track = made and [x for x, fits in zip(group, made["inliers"], strict=True) if fits]
-            if track and len(dict(track)) > 1:
-                points.append((made["xyz"], list(dict(track).items())))
-    return keypoints, points

@@ -75,7 +75,6 @@ def latencies(solve: Solve, problems: list[tuple[Tensor, ...]], clients: int) ->
 
 
 def main() -> None:
-    """Measure, and write the results."""
     parser = command(__doc__)
     parser.add_argument("--requests", type=int, default=256)
     options = parser.parse_args()

@@ -30,7 +30,7 @@ from localiser import RATIO_TEST, Matches, Photo, Sift, match
 from shared import centre, command, pose_error, write
 from torch import Tensor, nn
 
-from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, gravity_prior
+from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, depth_points, gravity_prior
 from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, VERMILION, make_figure, save, themed
 
 KEYFRAME = 15  # frames from one keyframe to the next
@@ -85,8 +85,7 @@ def read_frame(image: Path, depth: Path, pose: Pose, intrinsics: Tensor, detecto
     pixels = lafs[0, :, :, 2].double()
     columns, rows = pixels.round().long().T
     far = torch.from_numpy(metres)[rows.clamp(0, len(metres) - 1), columns.clamp(0, metres.shape[1] - 1)]
-    rays = torch.cat((pixels + 0.5, torch.ones_like(pixels[:, :1])), 1) @ intrinsics.inverse().mT
-    points = (torch.where(far > 0, far, torch.nan)[:, None] * rays - pose.translation) @ pose.rotation
+    points, _ = depth_points(pixels + 0.5, far, intrinsics, pose, depth_sigma=0.0)
     return Photo(image.name, metres.shape, intrinsics, pose, lafs, descriptors, pixels + 0.5, points)
 
 
@@ -149,12 +148,6 @@ def place(pose: Pose) -> list[float]:
     return [round(x, 4) for x in centre(pose).tolist()]
 
 
-def moved(first: Pose, second: Pose) -> tuple[float, float]:
-    """Distance of two cameras in metres and angle between them in degrees."""
-    distance, angle = pose_error(first, second)
-    return distance.item(), angle.item()
-
-
 def track(
     frames: Sequence[Frame], intrinsics: Tensor, solver: nn.Module, prior: Callable[..., PosePrior | None], pairs: int
 ) -> dict[str, Any]:
@@ -172,15 +165,15 @@ def track(
             result = solver(world, img, intrinsics, img_sigma=PIXEL, world_cov=noise, prior=known)
         seconds.append(time.process_time() - start)
         pose = Pose(result.rotation[0], result.translation[0])
-        metres, degrees = moved(pose, last)
+        metres, degrees = pose_error(pose, last)
         possible = degrees < 3.0 * since * math.degrees(MOTION[0]) and metres < 3.0 * since * MOTION[1]
         if result.ok[0] or (known is not None and possible):
             last, since = pose, 1
         else:
             since += 1
         path.append(place(last))
-        errors.append(moved(last, frame.pose))
-    metres, degrees = np.array(errors).T
+        errors.append(torch.stack(pose_error(last, frame.pose)))
+    metres, degrees = torch.stack(errors).numpy().T
     return {
         "right": float(((metres < RIGHT[0]) & (degrees < RIGHT[1])).mean()),
         "rmse_m": float(np.sqrt((metres**2).mean())),
@@ -197,14 +190,13 @@ def run(folder: Path, intrinsics: Tensor) -> dict[str, Any]:
     solver = create_solver("pnpnet-set")
     refiner = PnPNet(None, RobustWeightedLM(m=4))  # the last pose is near: few iterations suffice
 
-    ways = (
-        (solver, lambda *_: None),
-        (solver, lambda last, since, _: motion_prior(last, since)),
-        *(
-            (way, lambda last, since, frame: with_gravity(motion_prior(last, since), frame.down))
-            for way in (solver, refiner)
-        ),
-    )
+    def by_motion(last: Pose, since: int, _: Frame) -> PosePrior:
+        return motion_prior(last, since)
+
+    def by_both(last: Pose, since: int, frame: Frame) -> PosePrior:
+        return with_gravity(motion_prior(last, since), frame.down)
+
+    ways = ((solver, lambda *_: None), (solver, by_motion), (solver, by_both), (refiner, by_both))
     for way in ways:
         track(frames[:2], intrinsics, *way, PAIRS[-1])  # the first call of a process takes longer
     runs: dict[str, dict[str, Any]] = {str(pairs): {} for pairs in PAIRS}
@@ -240,7 +232,6 @@ def draw(results: dict[str, Any], path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Track, write the results and draw."""
     parser = command(__doc__)
     parser.add_argument("--sequence", type=Path, help="folder of an RGB-D sequence of the TUM benchmark")
     parser.add_argument(

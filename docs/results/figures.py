@@ -12,12 +12,11 @@ import json
 import math
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
-from contextlib import suppress
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from itertools import cycle, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -123,12 +122,13 @@ def reach(table: pd.DataFrame) -> np.ndarray:
     return np.clip([table.rate - table.low, table.high - table.rate], 0, None)
 
 
-def draw_dots(path: str | Path, heading: Sequence[str], panels: Mapping[str, pd.DataFrame]) -> Path:
-    """Draw success: a row for each solver, a panel for each table with ``solver``, ``rate``, ``low`` and ``high``."""
-    styles = solver_styles(solver for table in panels.values() for solver in table.solver)
+@themed
+def draw_dots(path: str | Path, heading: Sequence[str], panels: Sequence[Panel]) -> Path:
+    """Draw panels of success, see :func:`draw_curves`, with a row for each solver."""
+    styles = solver_styles(solver for _, table, _ in panels for solver in table.solver)
     heights = 0.5, _ROW * len(styles) + 0.85
     figure, grid, columns = make_panels(len(panels), 3, heights, heading, shared=True)
-    for axes, (title, table) in zip(grid, panels.items(), strict=True):
+    for axes, (title, table, _) in zip(grid, panels, strict=True):
         for name, rate, (low, high) in zip(table.solver, table.rate, reach(table).T, strict=True):
             look, row = styles[name], list(styles).index(name)
             if not look["marker"]:  # a bound is a line across the panel
@@ -197,22 +197,11 @@ _PROTOCOL_N, _SCENE_OUTLIERS = 9, 2  # as in the paper
 _FEWEST_MISMATCHES = 3  # numbers of mismatches of a curve
 
 
-class NothingToDrawError(ValueError):
-    """The results hold no data for a figure."""
-
-
-def require(found: Sized, what: str) -> None:
-    """Raise when nothing was found."""
-    if not len(found):
-        raise NothingToDrawError(f"The results hold no {what} to draw.")
-
-
 def read_records(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Read results files. Data sets without a source or outliers are left out.
 
-    A row has the largest number of problems with its source, outliers, kind of outliers, n and solver; of several the
-    last. ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text. With ``mismatches``
-    every outlier shows another point. ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
+    ``outliers`` is a number, ``"uniform"`` for 0 to a third of the pairs, or another text. With ``mismatches`` every
+    outlier shows another point. ``base`` is the solver's name without the option m; an unknown ``m`` is -1.
     """
     rows, synthetic = [], {name for name, _ in PRIORS.values()}
     for result in results:
@@ -286,40 +275,42 @@ def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
     """Draw operation counts without and with RANSAC, see ``operations.complexity_results``: figure 1."""
     counts = {"n": complexity["n"], **complexity["counts"]}
     table = pd.DataFrame(counts).melt("n", var_name="solver", value_name="operations")
-    require(table, "operation counts")
     sampled = table.solver.isin(complexity["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
     panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
     return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
 
 
-@themed
-def plot_synthetic(path: str | Path, records: pd.DataFrame, source: str = "paper") -> Path:
-    """Draw success on synthetic data with no outliers, 0 to a third, and a third: figures 2 and 3."""
+class Content(NamedTuple):
+    """What a figure shows: panels of curves against the column ``x``, or of dots. ``table`` has all rows."""
+
+    title: str
+    table: pd.DataFrame
+    panels: list[Panel]
+    x: str = ""
+
+
+def synthetic(records: pd.DataFrame, source: str) -> Content:
+    """Success on synthetic data with no outliers, 0 to a third, and a third: figures 2 and 3."""
     table, n = at_usual_n(records.query("source == @source and not swept and not mismatches"))
-    parts = {setting: table[table.outliers == setting] for setting in (0, "uniform", n // 3)}
-    panels = {outliers_in_words(setting, n): part for setting, part in parts.items() if len(part)}
-    require(panels, f"success on '{source}' with none, uniform or {n // 3} outliers")
-    heading = [f"Success on {_SOURCES.get(source, source)}, n = {n}", in_words(pd.concat(panels.values()))]
-    return draw_dots(path, heading, panels)
+    table = table[table.outliers.isin([0, "uniform", n // 3])]
+    return Content(f"Success on {_SOURCES[source]}, n = {n}", table, _by_outliers(table, n))
 
 
-@themed
-def plot_scenes(path: str | Path, records: pd.DataFrame) -> Path:
-    """Draw success without and with two outliers over all scenes, and for each scene: figure 4."""
+def scenes(records: pd.DataFrame) -> Content:
+    """Success without and with two outliers over all scenes, and for each scene: figure 4."""
     table = records.query("scene and not swept and not mismatches")
     table, n = at_usual_n(table[table.outliers.isin([0, _SCENE_OUTLIERS])])
-    require(table, f"success on scenes with 0 or {_SCENE_OUTLIERS} outliers")
-    panels = {}
+    panels = []
     for setting, chosen in table.groupby("outliers"):
-        words, scenes = outliers_in_words(setting, n), list(chosen.groupby("source", sort=False))
-        if len(scenes) > 1:
-            panels[f"{words}: all {len(scenes)} scenes"] = pooled(chosen)
-        panels |= {f"{words}: {scene}": part for scene, part in scenes}
-    return draw_dots(path, [f"Success on scenes, n = {n}", in_words(table)], panels)
+        parts = list(chosen.groupby("source", sort=False))
+        together = [(f"all {len(parts)} scenes", pooled(chosen))] if len(parts) > 1 else []
+        words = outliers_in_words(setting, n)
+        panels += [(f"{words}: {name}", part, "rate") for name, part in together + parts]
+    return Content(f"Success on scenes, n = {n}", table, panels)
 
 
-def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:
-    """Draw success against the number of mismatches: figure 5.
+def mismatches(records: pd.DataFrame) -> Content:
+    """Success against the number of mismatches: figure 5.
 
     Success is pooled over the scenes that have the most numbers of mismatches. A solver that solved all these scenes at
     three numbers or more has a curve. Without sets of mismatches the outliers of the protocol are drawn.
@@ -333,35 +324,32 @@ def plot_mismatches(path: str | Path, records: pd.DataFrame) -> Path:
     table = table[table.source.isin(counts.index[counts >= most]) & table.outliers.isin(most)]
     label = f"{'mismatches' if kind else 'outliers'} among {n} pairs"
     parts = [pooled(part).assign(**{label: number}) for number, part in table.groupby("outliers")]
-    require(parts[_FEWEST_MISMATCHES - 1 :], f"scenes with {_FEWEST_MISMATCHES} numbers of mismatches")
-    rates = pd.concat(parts)
+    rates = pd.concat(parts) if parts else table
     rates = rates[rates.groupby("solver").rate.transform("size") >= _FEWEST_MISMATCHES]
-    require(rates, f"solvers with {_FEWEST_MISMATCHES} numbers of mismatches")
-    scenes = table.source.unique()
-    title = f"Success on {f'{len(scenes)} scenes' if len(scenes) > 1 else scenes[0]}, n = {n}"
-    return draw_curves(path, [title, in_words(table)], [("", rates, "rate")], label)
+    names = table.source.unique()
+    title = f"Success on {names[0] if len(names) == 1 else f'{len(names)} scenes'}, n = {n}"
+    return Content(title, table, [("", rates, "rate")] if len(rates) else [], label)
 
 
-def plot_against_n(path: str | Path, records: pd.DataFrame) -> Path:
-    """Draw success on the protocol's data against the number of pairs, a panel for each outlier setting.
+def against_n(records: pd.DataFrame) -> Content:
+    """Success on the protocol's data against the number of pairs, a panel for each outlier setting.
 
     Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve.
     Other solvers have a curve when they were measured at two n or more.
     """
     table = records.query("source == 'paper' and not swept and not mismatches")
     table = table[table.groupby("outliers").n.transform("nunique") > 1]
-    require(table, "success on 'paper' with several n and the same outliers")
-    families = [re.sub(rf"-n{n}\b", "-n*", solver) for solver, n in zip(table.solver, table.n, strict=True)]
-    single = table.groupby(families).solver.transform("nunique") == 1
-    table = table.assign(solver=table.solver.where(single, families))
+    names = zip(table.solver, table.n, strict=True)
+    table = table.assign(family=[re.sub(rf"-n{n}\b", "-n*", solver) for solver, n in names])
+    single = table.groupby("family").solver.transform("nunique") == 1
+    table = table.assign(solver=table.solver.where(single, table.family))
     several = table.groupby(["solver", "outliers"]).n.transform("size") > 1
     table = table[several | table.solver.str.match("pnpnet|net")]
-    heading = [f"Success on {_SOURCES['paper']} against the number of pairs", in_words(table)]
-    return draw_curves(path, heading, _by_outliers(table, "n"), "n")
+    return Content(f"Success on {_SOURCES['paper']} against the number of pairs", table, _by_outliers(table, "n"), "n")
 
 
-def plot_against_m(path: str | Path, records: pd.DataFrame) -> Path:
-    """Draw success on the protocol's data, and time, against the iterations of the refinement.
+def against_m(records: pd.DataFrame) -> Content:
+    """Success on the protocol's data, and time, against the iterations of the refinement.
 
     Solvers that differ only in the option m, such as ``epnp-lm`` and ``epnp-lm:m=3``, make one curve; m is read from
     their configurations. The time is of the last outlier setting.
@@ -369,20 +357,9 @@ def plot_against_m(path: str | Path, records: pd.DataFrame) -> Path:
     table, n = at_usual_n(records.query("source == 'paper' and m >= 0 and not mismatches"))
     table = table.assign(solver=table.base).drop_duplicates(["solver", "outliers", "m"], keep="last")
     table = table[table.groupby(["solver", "outliers"]).m.transform("size") > 1]
-    require(table, "success on 'paper' of a solver with several m")
     panels = _by_outliers(table, n)
-    panels.append((f"time, {panels[-1][0]}", panels[-1][1], "us"))
-    return draw_curves(path, [f"Success on {_SOURCES['paper']} against m, n = {n}", in_words(table)], panels, "m")
-
-
-_FIGURES: dict[str, Callable[..., Path]] = {
-    "figure2_paper.png": plot_synthetic,
-    "figure3_gaussian_pose.png": lambda path, records: plot_synthetic(path, records, "gaussian_pose"),
-    "figure4_scenes.png": plot_scenes,
-    "figure5_mismatches.png": plot_mismatches,
-    "success_against_n.png": plot_against_n,
-    "success_against_m.png": plot_against_m,
-}
+    panels += [(f"time, {title}", part, "us") for title, part, _ in panels[-1:]]
+    return Content(f"Success on {_SOURCES['paper']} against m, n = {n}", table, panels, "m")
 
 
 def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> list[Path]:
@@ -393,13 +370,23 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
     is in the figure against m only. ``results`` may have one file of operation counts.
     """
     complexity = [entry for entry in results if entry.get("kind") == "complexity"]
-    if len(complexity) > 1 or not results:
-        raise ValueError(f"Expected at least one results file and at most one of operation counts, got {len(results)}.")
+    if len(complexity) > 1:
+        raise ValueError(f"Expected at most one file of operation counts, got {len(complexity)}.")
     records = read_records(entry for entry in results if entry.get("kind") != "complexity")
     made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
-    for name, plot in _FIGURES.items():
-        with suppress(NothingToDrawError):
-            made.append(plot(Path(folder) / name, records))
+    for name, content in {
+        "figure2_paper": synthetic(records, "paper"),
+        "figure3_gaussian_pose": synthetic(records, "gaussian_pose"),
+        "figure4_scenes": scenes(records),
+        "figure5_mismatches": mismatches(records),
+        "success_against_n": against_n(records),
+        "success_against_m": against_m(records),
+    }.items():
+        if content.panels:
+            path, heading = Path(folder) / f"{name}.png", [content.title, in_words(content.table)]
+            made.append(
+                draw_curves(path, heading, *content[2:]) if content.x else draw_dots(path, heading, content.panels)
+            )
     if not made:
         raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
     return made

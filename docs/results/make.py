@@ -25,20 +25,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from measure import HERE, RESULTS, compare, measure, ship
+from measure import HERE, OTHERS, RESULTS, compare, measure, ship
 
 
 def main() -> None:
-    """Run one of the steps."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("measure", "compare", "ship", "render"))
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        default=(),
-        choices=(*RESULTS, "honesty", "probability", "judge", "complexity"),
-        help="for measure: these files",
-    )
+    parser.add_argument("--only", nargs="+", default=(), choices=(*RESULTS, *OTHERS), help="for measure: these files")
     scenes = HERE.parents[2] / "shared" / "data"
     parser.add_argument("--scenes", type=Path, default=scenes, help="folder of the scenes (default: %(default)s)")
     parser.add_argument("--synthetic-count", type=int, default=5000, help="problems of a synthetic set")

@@ -14,7 +14,6 @@ from figures import find_rows
 from measure import ANY, HERE
 from short_runs import read_summary
 
-from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.metrics import SuccessRate, success_rate
 
 #: Files of ``benchmarks/real_matches.py measure``, each on scenes that no solver had seen, the latest last.
@@ -85,21 +84,7 @@ def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     best = [best_peer({x: pooled[x] for x in pooled if x.endswith(SCORES) == scores}) for scores in (False, True)]
     shown = [name for name in others if not name.startswith("PoseLib") or name in best]
     rows = [*ours, *sorted(shown, key=lambda name: -pooled[name]["all"].success.rate)]
-    lines = []
-    for name in rows:
-        title_, mark = name.replace(f", {SCORES}", f" with {SCORES}"), "**" if name in ours else ""
-        cells = [title_, f"{BATCH}" if name in ours else "1"]
-        for kind in kinds:
-            cells += [f"{100 * pooled[name][kind].success.rate:.1f} %", microseconds(pooled[name][kind])]
-        lines.append([f"{mark}{cell}{mark}" for cell in cells])
-        if name in ours:
-            lines.append([title_, "1"])
-            for kind in kinds:
-                one, many = single[name][kind], batched[name][kind]
-                same = one.success.rate == many.success.rate
-                lines[-1] += ["same" if same else f"{100 * one.success.rate:.1f} %\\*", f"{microseconds(one)}\\*"]
     short = {"ratio test": "filtered", "no ratio test": "raw"}
-    header = ["Solver", "images per call", *(x for kind in kinds for x in (f"{short[kind]}: right", "µs per image"))]
     rates = [pooled[name][kind].success for name in rows for kind in kinds]
     ahead = []
     for kind in kinds:
@@ -114,7 +99,8 @@ def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             ahead += [f"{' and '.join(names)} {what} on {short[kind]} matches"] if names else []
     there = ((f"`{ANY}` in batches of {BATCH}", batched[ours[0]]), (best[0], single[best[0]]))
     return {
-        "table": markdown_table(header, lines),
+        **{"rows": rows, "ours": ours, "kinds": kinds, "short": short, "scores": SCORES, "batch": BATCH},
+        **{"pooled": pooled, "single": single, "batched": batched, "microseconds": microseconds},
         "total": pooled[ours[0]]["all"].success.total,
         "scenes": sum(len(results["counts"]) for results in files),
         "right": files[0]["settings"]["right"],
@@ -144,134 +130,46 @@ def points_ahead(pooled: Mapping[str, Mapping[str, Pooled]], ours: str = f"`{ANY
     return pooled[ours]["all"].success.rate - pooled[best_peer(pooled)]["all"].success.rate
 
 
-def percent(value: float | None) -> str:
-    """A share in per cent, without the sign."""
-    return "–" if value is None else f"{100 * value:.1f}"
-
-
-def group_table(results: Mapping[str, Any], kind: str) -> str:
-    """Success by share of outliers of one kind of matches, time, and the share of ``ok``."""
-    settings, found = results["settings"], find_rows(results, kind)
-    groups = ["all", *(f"{100 * a:.0f}–{100 * b:.0f} %" for a, b in pairwise(settings["shares"]))]
-    counts = [found[settings["solvers"][0]][group]["count"] for group in groups]
-    header = [f"{kind}: right (%)", "ms", *(f"{g} ({n})" for g, n in zip(groups, counts, strict=True))]
-    lines = []
-    for name, one in found.items():
-        every = one["all"]
-        ok = [percent(every[key]) for key in ("ok_of_right", "ok_of_far")]
-        shares = [percent(one[group]["success"]) for group in groups]
-        lines.append([title(name, settings), f"{every['ms_per_problem']:.2f}", *shares, *ok])
-    return markdown_table([*header, "ok of right", "ok of far off"], lines)
-
-
-def facts(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of one file of ``benchmarks/real_matches.py measure``, its number of problems, and the file."""
-    kinds = list(dict.fromkeys(row["kind"] for row in results["rows"]))
-    known = {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")}
-    lines = []
-    for entry in results["counts"]:
-        about = known.get(entry["scene"], {})
-        numbers = [str(entry[kind]["counted"]) for kind in kinds]
-        lines.append([entry["scene"], *(about.get(key, "–") for key in ("shows", "source", "licence")), *numbers])
-    header = ["Scene", "shows", "public repository", "licence", *(f"problems, {kind}" for kind in kinds)]
-    return {
-        "tables": {kind: group_table(results, kind) for kind in kinds},
-        "scenes": markdown_table(header, lines, align="llll" + "r" * len(kinds)),
-        "total": sum(entry[kind]["counted"] for entry in results["counts"] for kind in kinds),
-        "results": results,
-    }
-
-
-def pooled_table(files: Sequence[Mapping[str, Any]]) -> str:
-    """All solvers that every file has, both kinds, beside the best PoseLib."""
-    pooled = pool(files)
-    peer = best_peer(pooled)
-    kinds = [kind for kind in pooled[peer] if kind != "all"]
-    lines = []
-    for name, one in sorted(pooled.items(), key=lambda item: -item[1]["all"].success.rate):
-        rates = [f"{100 * one[kind].success.rate:.1f}" for kind in (*kinds, "all")]
-        times = [f"{one[kind].ms:.2f}" for kind in kinds]
-        lines.append([name, *rates, *times, f"{one['all'].ms / pooled[peer]['all'].ms:.2f}"])
-    header = ["Right (%)", *kinds, "both", *(f"ms, {kind}" for kind in kinds), f"time / {peer}"]
-    return markdown_table(header, lines)
-
-
-def measurements_table(files: Iterable[Mapping[str, Any]]) -> str:
-    """A line for each file: how far ``pnpnet-set`` is ahead of the PoseLib that is best on its problems."""
-    lines = []
-    for results in files:
-        pooled = pool([results])
-        peer = best_peer(pooled)
-        base = pooled[peer]["all"]
-        cells = [f"{100 * points_ahead(pooled, name):+.1f}" for name in (f"`{ANY}`", f"`{ANY}`, {SCORES}")]
-        ratio = pooled[f"`{ANY}`"]["all"].ms / base.ms
-        date, scenes = results["environment"]["date"][:10], len(results["counts"])
-        lines.append([date, f"{scenes}", f"{base.success.total}", peer, *cells, f"{ratio:.2f}"])
-    header = ["Measured", "scenes", "problems", "best PoseLib", f"`{ANY}` ahead (points)", "with scores", "time ratio"]
-    return markdown_table(header, lines, align="lrrlrrr")
-
-
 def page_facts(
     files: Sequence[Mapping[str, Any]], costs: Mapping[str, Any], keypoints: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Facts for the template of the page on real matches.
 
-    ``files`` are the files of :data:`MATCHES`; ``benchmarks/real_matches.py cost`` wrote ``costs``.
+    ``files`` are the files of :data:`MATCHES`; ``benchmarks/real_matches.py`` wrote ``costs`` with ``cost``, and
+    ``benchmarks/keypoints.py`` wrote ``keypoints``.
     """
-    first = files[0]
+    first, pooled = files[0], pool(files)
     solver = first["settings"]["solvers"][0]
-    curve = first["reliability"][solver]
-    deciles = [
-        [f"{i / 10:.1f} to {(i + 1) / 10:.1f}", f"{count:.0f}", percent(predicted), percent(observed)]
-        for i, (count, predicted, observed) in enumerate(
-            zip(*(curve[key] for key in ("number", "predicted", "observed")), strict=True)
-        )
-        if count
-    ]
     kinds = list(dict.fromkeys(row["kind"] for row in first["rows"]))
-    raw = find_rows(first, kinds[1])[solver]["all"]
     return {
         "first": first,
         "solver": title(solver, first["settings"]).replace(f", {SCORES}", f" with {SCORES}"),
-        "raw": raw,
-        "far_count": round(raw["far"] * raw["count"]),
+        "raw": find_rows(first, kinds[1])[solver]["all"],
         "costs": costs,
-        "pooled": pooled_table(files),
-        "measurements": measurements_table(files),
-        "total": sum(facts(results)["total"] for results in files),
-        "scene_count": sum(len(results["counts"]) for results in files),
-        "files": [{"name": name, **facts(results)} for name, results in zip(MATCHES, files, strict=True)],
-        "deciles": markdown_table(["predicted", "problems", "predicted mean (%)", "not far off (%)"], deciles),
-        "keypoints": keypoint_tables(keypoints),
+        "kinds": kinds,
+        "pooled": dict(sorted(pooled.items(), key=lambda item: -item[1]["all"].success.rate)),
+        "peer": best_peer(pooled),
+        "files": [facts(name, results, kinds) for name, results in zip(MATCHES, files, strict=True)],
+        "scenes": {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")},
+        "reliability": first["reliability"][solver],
+        "keypoints": keypoints,
+        "ways": [{row["way"]: row for row in one["rows"]} for one in keypoints["results"]],
+        **{"any": f"`{ANY}`", "scores": SCORES, "points_ahead": points_ahead, "title": title},
     }
 
 
-# Ways to use confidences that the page compares pairwise, the first minus the second.
-_WAYS = (("confidence=c", "weights=c**6"), ("confidence=c", "nothing"))
-
-
-def keypoint_tables(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of what ``benchmarks/keypoints.py`` wrote: errors, paired differences, sources of the keypoints."""
-    results = found["results"]
-    names = [one["source"] for one in results]
-    by_way = [{row["way"]: row for row in one["rows"]} for one in results]
-    errors = [
-        [f"`{way}`", *(f"{r[way]['error']:.3f}, {100 * r[way]['right']:.1f}, {100 * r[way]['ok']:.0f}" for r in by_way)]
-        for way in by_way[0]
-    ]
-    differences = [
-        [name, *("{:+.4f} ({:+.4f} to {:+.4f})".format(*r[way]["less"][base]["capped"]) for way, base in _WAYS)]
-        for name, r in zip(names, by_way, strict=True)
-    ]
-    sources = []
-    for one in results:
-        source = found["sources"][one["source"]]
-        numbers = [str(one["measured"]), f"{one['pairs']:.0f}", f"{100 * one['inliers']:.0f}"]
-        sources.append([one["source"], *numbers, f"{source['repository']}: {source['what']}. Seen: {source['seen']}"])
-    header = ("error, at most 0.5", *(f"`{way}` less `{base}`" for way, base in _WAYS))
+def facts(name: str, results: Mapping[str, Any], kinds: Iterable[str]) -> dict[str, Any]:
+    """Facts of one file of ``measure``: its best PoseLib, and its rows by kind and solver."""
+    pooled = pool([results])
+    shares = ["all", *(f"{100 * a:.0f}–{100 * b:.0f} %" for a, b in pairwise(results["settings"]["shares"]))]
+    total = sum(entry[kind]["counted"] for entry in results["counts"] for kind in kinds)
+    tables = {kind: find_rows(results, kind) for kind in kinds}
     return {
-        "errors": markdown_table(("pnpnet-set with", *names), errors),
-        "differences": markdown_table(header, differences),
-        "sources": markdown_table(("keypoints", "problems", "pairs", "inliers (%)", "source"), sources, align="lrrrl"),
-        "right": found["settings"]["right"],
+        "name": name,
+        "results": results,
+        "pooled": pooled,
+        "peer": best_peer(pooled),
+        "groups": shares,
+        "tables": tables,
+        "total": total,
     }

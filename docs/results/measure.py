@@ -37,6 +37,8 @@ RESULTS = (
     *("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m", "views", "distribution"),
     *("set", "set_told", "set_real", "set_real_told"),
 )
+#: Other files that ``make.py measure`` writes.
+OTHERS = ("honesty", "probability", "judge", "complexity")
 #: The paper's network as published, the same with our changes, and the network for any number of pairs.
 PAPER, OURS, ANY = "pnpnet-n9-paper", "pnpnet-n9", "pnpnet-set"
 METRIC_SCENES = ("strecha/fountain-P11", "strecha/Herz-Jesus-P25", "eth3d/courtyard")
@@ -115,18 +117,12 @@ class FromTheTruth(nn.Module):
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """Refine the true poses."""
-        return solve(self.solver, problems, init=problems.pose)
+        return self.solver(*problems[:3], init=problems.pose)
 
 
-def solve(solver: nn.Module, problems: Problems, **options: Any) -> PnPResult:
-    """Call a solver."""
-    result: PnPResult = solver(problems.world_points, problems.img_points, problems.intrinsics, **options)
-    return result
-
-
-def named(names: Iterable[str], found: Mapping[str, str]) -> dict[str, nn.Module]:
+def named(names: Iterable[str], found: Mapping[str, str] | None = None) -> dict[str, nn.Module]:
     """Solvers by their names on the page; ``found`` has the options of tuned solvers."""
-    return {name: load_solver(found.get(name, name)) for name in names}
+    return {name: load_solver((found or {}).get(name, name)) for name in names}
 
 
 def tune(data: Mapping[str, EvaluationData], label: str, names: Iterable[str] = tuple(TUNED)) -> dict[str, str]:
@@ -134,12 +130,10 @@ def tune(data: Mapping[str, EvaluationData], label: str, names: Iterable[str] = 
     best = {}
     for name in names:
         base, grid = TUNED[name]
-        choices = (
-            ",".join(f"{key}={x:g}" for key, x in zip(grid, values, strict=True)) for values in product(*grid.values())
-        )
-        candidates = {spec: load_solver(spec) for spec in (f"{base}{',' if ':' in base else ':'}{x}" for x in choices)}
-        results = evaluate(candidates, data, path=OUTPUTS / "tuning" / f"{label}, {name}.json", repeats=1)
-        total = dict.fromkeys(candidates, 0.0)
+        choices = product(*([f"{key}={x:g}" for x in values] for key, values in grid.items()))
+        specs = [f"{base}{',' if ':' in base else ':'}{','.join(choice)}" for choice in choices]
+        results = evaluate(named(specs), data, path=OUTPUTS / "tuning" / f"{label}, {name}.json", repeats=1)
+        total = dict.fromkeys(specs, 0.0)
         for row in results["rows"]:
             total[row["solver"]] += row["success"]["rate"]
         best[name] = max(total, key=lambda spec: total[spec])
@@ -191,12 +185,12 @@ def measure_depths(counts: Counts, _: set[str]) -> None:
     """Several numbers of iterations."""
     specs = [f"{name}:m={m}" for name in ("identity-lm", "epnp-lm", "reppnp-lm") for m in DEPTHS]
     specs += [f"{OURS}:m={m}" for m in range(PnPNet.from_pretrained(OURS).refine.m + 1)]
-    run("against_m", named(specs, {}), counts.draw(["synthetic"], "none,uniform"))
+    run("against_m", named(specs), counts.draw(["synthetic"], "none,uniform"))
 
 
 def measure_views(counts: Counts, _: set[str]) -> None:
     """Several guesses for each problem, and refinements from the true pose."""
-    solvers = named([f"{OURS}:views={count}" for count in VIEWS], {})
+    solvers = named([f"{OURS}:views={count}" for count in VIEWS])
     solvers[f"{OURS} from the truth"] = FromTheTruth(PnPNet.from_pretrained(OURS))
     kernels = {f"alpha = {alpha:g}": ("power", alpha) for alpha in (1.0, 1.5, 2.0)}
     kernels |= {f"{kernel}, {scale:g} px": (kernel, scale) for kernel, scale in SCALES}
@@ -234,7 +228,7 @@ def measure_set(counts: Counts, wanted: set[str]) -> None:
         run("set_real", named(few, tuned["real"]), real, tuned=tuned["real"])
     if "set_real_told" in wanted:
         sigma = tune_sigma(counts.tuning_scenes())
-        run("set_real_told", named((ANY,), {}), with_known_noise(real, sigma), img_sigma=sigma)
+        run("set_real_told", named((ANY,)), with_known_noise(real, sigma), img_sigma=sigma)
 
 
 def tune_sigma(data: Mapping[str, EvaluationData]) -> float:
@@ -242,7 +236,7 @@ def tune_sigma(data: Mapping[str, EvaluationData]) -> float:
     solved = dict.fromkeys(SIGMAS, 0.0)
     for sigma in SIGMAS:
         path = OUTPUTS / "tuning" / f"set, {sigma:g}.json"
-        rows = evaluate(named((ANY,), {}), with_known_noise(data, sigma), path=path, repeats=1)["rows"]
+        rows = evaluate(named((ANY,)), with_known_noise(data, sigma), path=path, repeats=1)["rows"]
         solved[sigma] = sum(row["success"]["rate"] for row in rows)
     return max(solved, key=lambda sigma: solved[sigma])
 
@@ -262,7 +256,7 @@ def measure_set_told(counts: Counts, _: set[str]) -> None:
     """The network for any number of pairs with known noise."""
     options: dict[str, Any] = {"count": 2 * counts.synthetic, "seed": SEED_REPORT + 20, "known_noise": True}
     sets = counts.draw(["synthetic", "any_rotation"], "none,uniform,3", **options)
-    run("set_told", named((ANY, "known-inliers-and-noise"), {}), sets)
+    run("set_told", named((ANY, "known-inliers-and-noise")), sets)
 
 
 @torch.no_grad()
@@ -283,7 +277,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     diagrams = {}
     for name, entry in sets.items():
         problems = entry.problems
-        guess = solver.with_starts(problems.world_points, problems.img_points, problems.intrinsics)[1]
+        guess = solver.with_starts(*problems[:3])[1]
         found = reliability(guess.weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}
@@ -296,7 +290,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
         names = (ANY, *((OURS,) if n == 9 else ()), "p3p-ransac", "opencv-ransac", "poselib")
         for name, other in named(names, tuned).items():
             for kind, problems in kinds.items():
-                oks.setdefault(f"n = {n}, {kind}", {})[name] = success_rate(solve(other, problems).ok)._asdict()
+                oks.setdefault(f"n = {n}, {kind}", {})[name] = success_rate(other(*problems[:3]).ok)._asdict()
 
     covariances = {}
     solver = solver.double()
@@ -310,9 +304,8 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
 def covariance_check(solver: PnPNet, problems: Problems) -> dict[str, Any]:
     """Squared pose errors relative to the covariance: their mean, and the share below the 95 % quantile."""
     sigmas: dict[str, Any] = problems.sigmas
-    result = solve(solver, problems, **sigmas)
-    pairs = (problems.world_points, problems.img_points, problems.intrinsics)
-    covariance = pose_covariance(result.pose, *pairs, **sigmas, weights=result.weights)
+    result = solver(*problems[:3], **sigmas)
+    covariance = pose_covariance(result.pose, *problems[:3], **sigmas, weights=result.weights)
     turn = rotation_matrix_to_axis_angle(result.rotation @ problems.pose.rotation.mT)
     error = torch.cat((turn, result.translation - problems.pose.translation), -1)  # (B, 6)
     squares = (error * torch.linalg.solve(covariance, error)).sum(-1)
@@ -338,7 +331,7 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    wanted = set(only or (*RESULTS, "honesty", "probability", "judge", "complexity"))
+    wanted = set(only or (*RESULTS, *OTHERS))
     for names, step in STEPS:
         if wanted & names:
             step(Counts(scenes, synthetic_count, real_count), wanted & names)
@@ -364,7 +357,7 @@ def compare(scenes: Path, count: int, runs: Sequence[Path]) -> None:
 
 def ship(runs: Sequence[Path]) -> None:
     """Put the weights of the last run into the package, with the learning curves of all runs."""
-    results = load_run(runs[-1] / "results.json")
+    results = load_run(runs[-1] / RESULTS_NAME)
     kind = "set" if results.initializer == "SetInit" else f"n{results.config['model']['n']}"
     kind += "-paper" if results.config["name"].endswith("-paper") else ""
     collect_weights(runs, WEIGHTS_FOLDER / f"pnpnet-{kind}")

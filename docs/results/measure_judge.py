@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import torch
-from measure_probability import ARGUMENTS, errors, kinds
+from measure_probability import ARGUMENTS, Drawn, errors, kinds
 from torch import Tensor
 
 from kornia_pnpnet import Pose
@@ -54,25 +53,15 @@ PARTS: dict[str, tuple[Any, str, Any]] = {
 }
 
 
-class Set(NamedTuple):
-    """Problems: inputs, true pose, the usual distance of the points, and the largest errors of a solved problem.
-
-    The second limit is in the unit of the world if ``relative`` is false, and otherwise a share of the distance.
-    """
-
-    name: str
-    inputs: dict[str, Any]
-    truth: Pose
-    distance: Tensor
-    limits: tuple[float, float]
-    relative: bool = True
+#: Problems, and the largest errors of a solved problem in degrees and in the unit of the world or, if true, distances.
+Set = tuple[Drawn, tuple[float, float], bool]
 
 
 def sets(scenes: Path, seed: int) -> Iterator[Set]:
     """Synthetic problems, a clean scene, outdoor matches, indoor matches with depth maps, and keypoints of objects."""
     for kind in kinds(seed):
-        if kind.name in _SYNTHETIC and kind.truth is not None:
-            yield Set(f"synthetic, {kind.name}", kind.inputs, kind.truth, kind.distance, (2.0, 0.05))
+        if kind.name in _SYNTHETIC:
+            yield kind._replace(name=f"synthetic, {kind.name}"), (2.0, 0.05), True
     objects = SyntheticProblems(
         n=12,
         batch_size=500,
@@ -84,15 +73,9 @@ def sets(scenes: Path, seed: int) -> Iterator[Set]:
         world_sigma=0.0,
         degrees=(2.0, 8.0),
     )
+    yield Drawn.of("keypoints, synthetic", objects.batch(0)), (5.0, 0.05), True
     door = SceneProblems(load_scene(scenes / "colmap" / "lund_door"), n=9, batch_size=1000, seed=seed)
-    for name, source, limits in (
-        ("keypoints, synthetic", objects, (5.0, 0.05)),
-        ("lund_door, 9 pairs", door, (1.0, 0.005)),
-    ):
-        p = source.batch(0)
-        yield Set(
-            name, dict(zip(ARGUMENTS, p[:3], strict=True)), p.pose, p.true_cam_points[..., 2].median(1).values, limits
-        )
+    yield Drawn.of("lund_door, 9 pairs", door.batch(0)), (1.0, 0.005), True
     for name, file, limits, relative in (
         ("outdoor matches", "raw/by_image.npz", (1.0, 0.01), True),
         ("indoor matches, RGB-D", "rgbd/indoor.npz", (5.0, 0.05), False),
@@ -100,12 +83,12 @@ def sets(scenes: Path, seed: int) -> Iterator[Set]:
         read = np.load(scenes / file)
         x = {key: torch.from_numpy(read[key]) for key in ("W", "I", "M", "K", "R", "t", "kind")}
         for number, label in ((0, "ratio test"), (1, "no ratio test")):
-            world, img, mask, cameras, rotation, translation = (x[key][x["kind"] == number] for key in "WIMKRt")
-            inputs = {"world_points": world.float(), "img_points": img.float(), "intrinsics": cameras.float()}
-            truth = Pose(rotation.float(), translation.float())
-            depth = (world.float() @ truth.rotation.mT + truth.translation[:, None])[..., 2]
+            mask, *rest = (x[key][x["kind"] == number] for key in "MWIKRt")
+            world, img, cameras, rotation, translation = (value.float() for value in rest)
+            inputs = {**dict(zip(ARGUMENTS, (world, img, cameras), strict=True)), "mask": mask}
+            depth = (world @ rotation.mT + translation[:, None])[..., 2]
             distance = depth.where(mask, torch.nan).nanmedian(1).values
-            yield Set(f"{name}, {label}", {**inputs, "mask": mask}, truth, distance, limits, relative)
+            yield Drawn(f"{name}, {label}", inputs, Pose(rotation, translation), distance), limits, relative
 
 
 @torch.no_grad()
@@ -116,24 +99,24 @@ def measure_judge(scenes: Path, seed: int) -> dict[str, Any]:
         whole = judged(one)
         rows = {"": summary(whole, whole)}
         for part, (owner, name, value) in PARTS.items():
-            with ExitStack() as stack:
-                stack.enter_context(mock.patch.object(owner, name, value))
+            with mock.patch.object(owner, name, value):
                 rows[part] = summary(whole, judged(one))
-        made["sets"][one.name] = rows
-        print(one.name, rows[""], flush=True)
+        made["sets"][one[0].name] = rows
+        print(one[0].name, rows[""], flush=True)
     return made
 
 
 def judged(one: Set) -> dict[str, Tensor]:
     """Solve a set: which poses are right, far off, and ``ok``."""
-    solver, size = load_solver("pnpnet-set"), len(one.distance)
-    at_once = _AT_ONCE if "mask" in one.inputs else size
-    results = [solver(**{key: x[i : i + at_once] for key, x in one.inputs.items()}) for i in range(0, size, at_once)]
+    solver, (drawn, limits, relative) = load_solver("pnpnet-set"), one
+    size = len(drawn.distance)
+    at_once = _AT_ONCE if "mask" in drawn.inputs else size
+    results = [solver(**{key: x[i : i + at_once] for key, x in drawn.inputs.items()}) for i in range(0, size, at_once)]
     pose = Pose(*(torch.cat([getattr(x, key) for x in results]) for key in ("rotation", "translation")))
-    turn, shift = errors(pose, one.truth)
-    unit = one.distance if one.relative else 1.0
-    right = (turn < one.limits[0]) & (shift < one.limits[1] * unit)
-    far = (turn > 10.0) | (shift > 0.3 * one.distance)
+    assert drawn.truth is not None
+    turn, shift = errors(pose, drawn.truth)
+    right = (turn < limits[0]) & (shift < limits[1] * (drawn.distance if relative else 1.0))
+    far = (turn > 10.0) | (shift > 0.3 * drawn.distance)
     return {"right": right, "far": far, "ok": torch.cat([x.ok for x in results])}
 
 

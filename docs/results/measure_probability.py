@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
-from kornia_pnpnet import PnPNet, Pose
+from kornia_pnpnet import PnPNet, Pose, Problems
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.judge import belief
@@ -70,6 +70,12 @@ class Drawn(NamedTuple):
     truth: Pose | None
     distance: Tensor
 
+    @classmethod
+    def of(cls, name: str, problems: Problems) -> Drawn:
+        """Problems of a source."""
+        inputs = dict(zip(ARGUMENTS, problems[:3], strict=True))
+        return cls(name, inputs, problems.pose, problems.true_cam_points[..., 2].median(1).values)
+
 
 def kinds(seed: int) -> Iterator[Drawn]:
     """Every kind of problems."""
@@ -80,11 +86,7 @@ def kinds(seed: int) -> Iterator[Drawn]:
         options: Any = OmegaConf.to_container(config[source], resolve=True)
         for n in sizes:
             drawn = {**options, "n": n, "batch_size": PROBLEMS, "seed": seed + n}
-            p = instantiate(drawn, _convert_="all").batch(0)
-            distance = p.true_cam_points[..., 2].median(1).values
-            yield Drawn(
-                f"{source.split('_')[0]}, {n} pairs", dict(zip(ARGUMENTS, p[:3], strict=True)), p.pose, distance
-            )
+            yield Drawn.of(f"{source.split('_')[0]}, {n} pairs", instantiate(drawn, _convert_="all").batch(0))
     for kind in doubtful(PROBLEMS, seed):
         distance = torch.ones(PROBLEMS)
         if kind.truth is not None:

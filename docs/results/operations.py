@@ -65,7 +65,7 @@ def solve(n: int, columns: int) -> float:
 
 
 def sort(n: int) -> float:
-    r"""Sorting n numbers with :math:`n \log_2 n` comparisons."""
+    """Sorting n numbers with n log2 n comparisons."""
     return n * math.log2(n) * COMPARE if n > 1 else 0
 
 
@@ -95,6 +95,7 @@ _ELEMENTWISE = {
         ("acos atan2 cos lgamma log log1p sin tanh", LOG),
         ("sigmoid", EXP + ADD + DIVIDE),
         ("addcmul", MULTIPLY + ADD),
+        ("addcdiv", DIVIDE + ADD),
         ("lerp", 2 * ADD + MULTIPLY),
         ("linalg_cross", ADD + 2 * MULTIPLY),
         ("ceil clamp_min eq ge gt isinf isnan le lt maximum minimum ne relu", COMPARE),
@@ -112,16 +113,17 @@ _REDUCTIONS = {
 }
 # Cost for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., float]] = {
-    "mm": lambda first, second: matmul(first[0], first[1], second[1]),
+    **dict.fromkeys(("mm", "bmm"), lambda first, second: matmul(first[0], first[1], second[1])),
+    **dict.fromkeys(
+        ("addmm", "baddbmm"),
+        lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * ADD,
+    ),
     "mv": lambda first, second: matmul(first[0], first[1], 1),
-    "bmm": lambda first, second: matmul(first[0], first[1], second[1]),
-    "addmm": lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * ADD,
     "linalg_cholesky_ex": lambda matrix: cholesky(matrix[0]),
     "linalg_inv_ex": lambda matrix: solve(matrix[0], matrix[0]),
     "_linalg_solve_ex": lambda matrix, right: solve(matrix[0], right[1]),
     "_linalg_det": lambda matrix: solve(matrix[0], 0) + (matrix[0] - 1) * MULTIPLY,
     "cholesky_solve": lambda right, factor: right[1] * 2 * factor[0] * (factor[0] - 1 + DIVIDE),
-    "baddbmm": lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * ADD,
     # With both sets of vectors: about 21 n^3, half of them products. Source: as below, section 8.6.
     "_linalg_svd": lambda matrix: 10.5 * matrix[0] ** 3 * (ADD + MULTIPLY),
     # Tridiagonal form and QR iterations with eigenvectors: about 9 n^3, half of them products. Source: G. Golub and C.
@@ -195,12 +197,6 @@ class OperationCounter(TorchDispatchMode):
     """Count the operations of the tensor code that runs inside a ``with`` block, in ``total``.
 
     ``NotImplementedError`` for a PyTorch operation whose cost is unknown, so that no operation is missed.
-
-    Example:
-        >>> with OperationCounter() as counter:
-        ...     product = torch.ones(4, 2, 3) @ torch.ones(4, 3, 5)
-        >>> counter.total  # 4 * 2 * 5 entries with 3 multiplications and 2 additions each
-        200.0
     """
 
     def __init__(self) -> None:

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 from measure import BOUNDS
 
-from kornia_pnpnet.core.tables import markdown_table
-
 
 def interval(rate: float, low: float, high: float) -> str:
     """A rate with its interval."""
@@ -85,33 +83,16 @@ class Rates:
         """Success in per cent for a table, a dash where the solver did not solve the set."""
         return f"{self.rate(data, solver):.1f}" if (data, solver) in self.rows else "–"
 
-    def by_set(self, known: Rates | None = None) -> str:
-        """A line for each set and a column for each solver, in per cent. The best solver that is no bound is bold.
+    def first(self, data: str, solver: str) -> bool:
+        """Whether no other solver solves more of a set, bounds aside."""
+        best = self.best(data, [name for name in self.solvers if name not in BOUNDS])
+        return (data, solver) in self.rows and self.rate(data, solver) == self.rate(data, best)
 
-        The last column is of ``known``, the rates of a solver that knew the noise of the same sets.
-        """
-        lines = []
-        for data in self.sets:
-            best = self.best(data, [name for name in self.solvers if name not in BOUNDS])
-            first = [x for x in self.solvers if (data, x) in self.rows and self.rate(data, x) == self.rate(data, best)]
-            cells = (f"**{self.cell(data, x)}**" if x in first else self.cell(data, x) for x in self.solvers)
-            lines.append([shown(data), *cells])
-            lines[-1] += [known.cell(f"{data}, noise told", known.solvers[0])] if known else []
-        header = ["Solved (%)", *(f"`{name}`" for name in self.solvers)]
-        return markdown_table([*header, f"`{known.solvers[0]}`, noise known"] if known else header, lines)
-
-    def by_solver(self, *, times: bool = False) -> str:
-        """A line for each solver and a column for each set: success in per cent and, with ``times``, microseconds."""
+    def titles(self) -> tuple[str, list[str]]:
+        """What the names of all sets begin with, and the titles of the sets without it."""
         start = self.sets[0].rpartition(", ")[0]
-        common = all(data.startswith(start) for data in self.sets)
-        titles = [shown(data.removeprefix(f"{start}, ") if common else data) for data in self.sets]
-        header = [f"Solved (%), {shown(start)}" if common else "Solved (%)", *titles]
-        lines = []
-        for name in self.solvers:
-            cells = [self.cell(data, name) for data in self.sets]
-            us = (f"{self.time(x, name):.0f}" if (x, name) in self.rows else "–" for x in self.sets if times)
-            lines.append([f"`{name}`", *cells, *us])
-        return markdown_table([*header, *(f"µs, {title}" for title in titles if times)], lines)
+        start = start if all(data.startswith(start) for data in self.sets) else ""
+        return shown(start), [shown(data.removeprefix(f"{start}, ")) for data in self.sets]
 
 
 def compare_all(files: Iterable[Rates], solver: str, others: Sequence[str]) -> Standing:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matches import MATCHES, overview, page_facts
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from problem_picture import plot_problem
-from rates import Rates, compare_all
-from short_runs import ablation, capacity, read_summary, sweep
+from rates import Rates, compare_all, interval, shown
+from short_runs import KERNEL, ablation, capacity, percent, read_summary, sweep
 
 from kornia_pnpnet import PnPNet
-from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.evaluation.plots import plot_training
 from kornia_pnpnet.evaluation.results import format_table, load_results
 from kornia_pnpnet.metrics import SuccessRate
@@ -41,95 +40,32 @@ def written(template: str, **facts: Any) -> str:
     return environment.get_template(template).render(**facts)
 
 
-def summary(benchmark: Mapping[str, Any]) -> str:
-    """Success and time of the most used solvers on synthetic problems: the default solver, then by success."""
-    rows = {(row["solver"], row["set"]): row for row in benchmark["rows"]}
-    found = []
-    for spec in dict.fromkeys(solver for solver, _ in rows):
-        if spec.partition(":")[0] in SUMMARY_SOLVERS:
-            rates, cells = [], []
-            for row in (rows.get((spec, name)) for name in SUMMARY_SETS):
-                rates.append(row["success"]["rate"] if row else 0.0)
-                cells += [f"{100 * rates[-1]:.1f}", f"{row['median_us']:.0f}"] if row else ["–", "–"]
-            found.append((spec != ANY, -rates[0], [f"`{spec}`", *cells]))
-    found.sort(key=lambda entry: entry[:2])
-    header = [text for name in SUMMARY_SETS.values() for text in (f"{name}: solved (%)", "µs")]
-    return markdown_table(["Solver", *header], [line for *_, line in found])
+def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Rows of the most used solvers on synthetic problems, by solver: the default solver, then by success."""
+    chosen = [row for row in rows if row["set"] in SUMMARY_SETS and row["solver"].partition(":")[0] in SUMMARY_SOLVERS]
+    found = grouped(chosen, "solver")
+    return dict(sorted(found.items(), key=lambda x: (x[0] != ANY, -x[1][0]["success"]["rate"])))
 
 
-def unknown_focal(measured: Mapping[str, Any]) -> str:
-    """Success and time on real matches without the focal length, from ``benchmarks/cameras.json``."""
-    solvers: dict[str, list[str]] = {}
-    for row in measured["real"]:
-        cells = [f"{100 * row['success']:.1f}", f"{100 * row['far_but_ok']:.1f}", f"{row['us'] / 1000:.1f}"]
-        solvers.setdefault(f"`{row['solver']}`", []).extend(cells)
-    kinds = dict.fromkeys(row["kind"] for row in measured["real"])
-    header = [text for kind in kinds for text in (f"{kind}: solved (%)", "far, believed (%)", "ms")]
-    return markdown_table(["Solver", *header], [[name, *cells] for name, cells in solvers.items()])
+def grouped(rows: Iterable[Mapping[str, Any]], key: str) -> dict[str, list[Mapping[str, Any]]]:
+    """Rows by one of their entries."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row[key], []).append(row)
+    return found
 
 
-def rigs(measured: Mapping[str, Any]) -> dict[str, float]:
-    """Least success on rigs and the range of times as fast as PoseLib. From the same file."""
-    cells: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for row in measured["rigs"]:
-        cells.setdefault((row["cameras"], row["baseline"], row["n"], row["share"]), {})[row["solver"]] = row
-    ratios = [found["PoseLib"]["us"] / found[ANY]["us"] for found in cells.values()]
-    success = [{name: 100 * found[name]["success"] for name in (ANY, "PoseLib")} for found in cells.values()]
+def rigs(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Least success on rigs and the range of times as fast as PoseLib."""
+    by_solver = grouped(rows, "solver")
+    ours, theirs = by_solver[ANY], by_solver["PoseLib"]
+    ratios = [y["us"] / x["us"] for x, y in zip(ours, theirs, strict=True)]
     return {
         "slowest": min(ratios),
         "fastest": max(ratios),
-        "least": min(x[ANY] for x in success),
-        "least_poselib": min(x["PoseLib"] for x in success),
+        "least": 100 * min(x["success"] for x in ours),
+        "least_poselib": 100 * min(x["success"] for x in theirs),
     }
-
-
-def honesty(found: Mapping[str, Any]) -> dict[str, Any]:
-    """How many answers are ``ok``, how well weights are calibrated, and how well covariances fit."""
-    names = list(dict.fromkeys(name for rates in found["ok"].values() for name in rates))
-    oks = [
-        [kind, *(f"{100 * rates[name]['rate']:.1f}" if name in rates else "–" for name in names)]
-        for kind, rates in found["ok"].items()
-    ]
-    found_cov = found["covariance"]
-    covariances = [[name, f"{x['mean']:.2f}", str(SuccessRate(**x["inside"]))] for name, x in found_cov.items()]
-    means, inside = ([x["mean"] for x in found_cov.values()], [100 * x["inside"]["rate"] for x in found_cov.values()])
-    return {
-        "oks": markdown_table(["`ok` (%)", *(f"`{name}`" for name in names)], oks),
-        "covariances": markdown_table(["Problems", "mean", "below the limit"], covariances),
-        "mean": (min(means), max(means)),
-        "inside": (min(inside), max(inside)),
-        "errors": [entry["error"] for entry in found["reliability"].values()],
-    }
-
-
-def belief(found: Mapping[str, Any]) -> str:
-    """How many far-off poses and how many right poses are ``ok``, by kind of problem and solver."""
-    names = [name for name in found if name not in ("environment", "law")]
-    lines = []
-    for kind in found[names[0]]["kinds"]:
-        line = [kind]
-        for name in names:
-            rates = found[name]["kinds"][kind]
-            shares = (rates.get(key) for key in ("ok_of_far", "ok_of_right"))
-            line.append(" / ".join("–" if x is None else f"{100 * x['rate']:.1f}" for x in shares))
-        lines.append(line)
-    return markdown_table(["`ok` of far-off / of right poses (%)", *(f"`{name}`" for name in names)], lines)
-
-
-def judge(found: Mapping[str, Any]) -> str:
-    """What each part of the judge is worth: a row for each part, a column for each set."""
-    sets = found["sets"]
-    whole = {name: rows[""] for name, rows in sets.items()}
-
-    def cell(name: str, part: str) -> str:
-        row, before = sets[name][part], whole[name]
-        change, error = (100 * x for x in (row["success"] - before["success"], row["error"]))
-        return f"{change:+.1f} ± {error:.1f}; {100 * row['far_ok']:.1f}"
-
-    first = [f"{100 * row['success']:.1f}; {100 * row['far_ok']:.1f}" for row in whole.values()]
-    parts = [part for part in next(iter(sets.values())) if part]
-    lines = [["whole judge", *first], *([f"without {part}", *(cell(name, part) for name in sets)] for part in parts)]
-    return markdown_table(["Solved (%) or change; far off and `ok` (%)", *sets], lines)
 
 
 def page() -> str:
@@ -151,16 +87,19 @@ def page() -> str:
         results=results,
         operations={name: counts[at_nine] for name, counts in complexity["counts"].items()},
         overview=written("overview.md.jinja", link="real_matches.md", **overview(load_matches())),
-        summary=summary(benchmark),
+        summary=summary(benchmark["rows"]),
+        summary_sets=SUMMARY_SETS,
         benchmark=benchmark,
-        unknown_focal=unknown_focal(cameras),
-        rigs=rigs(cameras),
+        unknown_focal=grouped(cameras["real"], "solver"),
+        rigs=rigs(cameras["rigs"]),
         beside_robust=compare_all((rates["set"], rates["set_real"]), ANY, ROBUST),
         beside_peers=compare_all((rates["set"], rates["set_real"]), ANY, PEERS),
         ours_beside_peers=compare_all((rates["paper"], rates["gaussian_pose"], rates["real"]), OURS, PEERS),
-        honest=honesty(load("honesty")),
-        belief=belief(load("probability")),
-        judge=judge(load("judge")),
+        honest=load("honesty"),
+        believed={name: x["kinds"] for name, x in load("probability").items() if "kinds" in x},
+        judged=load("judge")["sets"],
+        rate=lambda x: str(SuccessRate(**x)),
+        **{"interval": interval, "percent": percent, "kernel": KERNEL},
         chi_square=CHI_SQUARE_95,
         distribution_table=format_table(results["distribution"]),
         ablation=ablation(runs["ablation"]),
@@ -168,6 +107,7 @@ def page() -> str:
         capacity=capacity(runs["capacity"], "set-{width}x{layers}x{hidden}".format(**any_network.config)),
         weights=shipped_weights(),
         rates=rates,
+        shown=shown,
     )
 
 

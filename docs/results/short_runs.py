@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
 from figures import mix_in_words
 from measure import HERE
-from rates import interval
-
-from kornia_pnpnet.core.tables import markdown_table
 
 EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
 KERNEL = "model.solver.refine.kernel"  # column of a summary
@@ -21,9 +18,7 @@ Row = Mapping[str, str]
 
 
 def read_summary(path: Path) -> list[Row]:
-    """The rows of the summary of a multirun, none when there is no file."""
-    if not path.exists():
-        return []
+    """The rows of the summary of a multirun."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -44,11 +39,6 @@ def compared(runs: Sequence[Row], others: Sequence[Row], data: str) -> str:
     return f"{difference:+.1f} points ({'above' if above else 'below' if below else 'intervals overlap'})"
 
 
-def updates_of(rows: Sequence[Row]) -> str:
-    """Number of updates of the runs; all numbers when they differ."""
-    return " or ".join(dict.fromkeys(row["update"] for row in rows))
-
-
 def claim(experiment: str) -> str:
     """The claim in the first comment of an experiment's file."""
     lines = (EXPERIMENTS / f"{experiment}.yaml").read_text(encoding="utf-8").splitlines()
@@ -56,16 +46,16 @@ def claim(experiment: str) -> str:
     return comment.partition("Claim: ")[2]
 
 
+def validation_sets(rows: Sequence[Row]) -> list[str]:
+    """Names of the validation sets of runs."""
+    return [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
+
+
 def ablation(rows: Sequence[Row]) -> dict[str, Any]:
     """Facts of the ablations: a table, and by experiment and as ``verdicts`` the comparison with the recipe."""
-    sets = [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
+    sets = validation_sets(rows)
     recipe = [row for row in rows if row["experiment"] == "recipe"]
     others = [row for row in rows if row not in recipe]
-    lines = []
-    for row in [*recipe, *others]:
-        seed = f"seed={row['seed']}" if row.get("seed") else ""
-        name = " ".join(filter(None, (row["experiment"], row.get(KERNEL), seed)))
-        lines.append([f"`{name}`", *(interval(*percent(row, data)) for data in sets)])
     kinds: dict[tuple[str, str], list[Row]] = {}
     for row in others:
         kinds.setdefault((row["experiment"], row.get(KERNEL, "")), []).append(row)
@@ -74,14 +64,15 @@ def ablation(rows: Sequence[Row]) -> dict[str, Any]:
     for (experiment, kind), runs in kinds.items():
         found = ", ".join(f"{data} {compared(runs, recipe, data)}" for data in sets)
         verdict = "Lower success" if "(below)" in found else "Higher success" if "(above)" in found else None
-        verdicts[verdict or "No difference seen"].append(f"`{experiment}{' ' if kind else ''}{kind}`")
+        verdicts[verdict or "No difference seen"].append(f"`{f'{experiment} {kind}'.strip()}`")
         findings.setdefault(experiment, {})[kind] = found
     rates = [[percent(row, data)[0] for row in recipe] for data in sets]
     return {
-        "updates": updates_of(rows),
+        "updates": rows[0]["update"],
         "seeds": len(recipe),
         "spread": max(max(values) - min(values) for values in rates),
-        "table": markdown_table(["Run", *(f"{data} (%)" for data in sets)], lines),
+        "sets": sets,
+        "runs": [*recipe, *others],
         "verdicts": verdicts,
         "findings": [{"experiment": name, "claim": claim(name), "found": found} for name, found in findings.items()],
     }
@@ -91,42 +82,31 @@ def sweep(rows: Sequence[Row]) -> dict[str, Any]:
     """Facts of the sweep: a table of n and mix against m, and the steps in m and in n at the middle of the other."""
     runs = {(int(row["model.n"]), int(row["model.m"]), float(row["data.outliers.max_ratio"])): row for row in rows}
     all_n, all_m, mixes = (sorted(set(values)) for values in zip(*runs, strict=True))
-    lines = []
-    for n in all_n:
-        for mix in mixes:
-            cells = [interval(*percent(runs[n, m, mix], "uniform")) for m in all_m]
-            lines.append([f"{n}", mix_in_words(mix), *cells])
-        times = [min(float(runs[n, m, mix]["us_per_problem"]) for mix in mixes) for m in all_m]
-        lines.append([f"{n}", "µs", *(f"{time:.0f}" for time in times)])
-    header = ["n", "trained and tested on", *(f"m = {m} (%)" for m in all_m)]
+    times = {(n, m): min(float(runs[n, m, mix]["us_per_problem"]) for mix in mixes) for n in all_n for m in all_m}
     n, m = all_n[len(all_n) // 2], all_m[len(all_m) // 2]
 
-    def steps(values: Sequence[int], pairs: Iterable[tuple[Row, Row]]) -> str:
+    def steps(found: Mapping[int, Row]) -> str:
         return ", ".join(
-            f"{low} → {high} {compared([after], [before], 'uniform')}"
-            for (low, high), (before, after) in zip(pairwise(values), pairs, strict=True)
+            f"{low} → {high} {compared([found[high]], [found[low]], 'uniform')}" for low, high in pairwise(found)
         )
 
     findings = [
-        f"{mix_in_words(mix)}: m at n = {n}, {steps(all_m, pairwise(runs[n, x, mix] for x in all_m))}; "
-        f"n at m = {m}, {steps(all_n, pairwise(runs[x, m, mix] for x in all_n))}."
+        f"{mix_in_words(mix)}: m at n = {n}, {steps({x: runs[n, x, mix] for x in all_m})}; "
+        f"n at m = {m}, {steps({x: runs[x, m, mix] for x in all_n})}."
         for mix in mixes
     ]
-    table = markdown_table(header, lines, align="rl" + "r" * len(all_m))
-    return {"updates": updates_of(rows), "table": table, "findings": findings}
+    axes = {"n": all_n, "m": all_m, "mixes": {mix: mix_in_words(mix) for mix in mixes}}
+    return {"updates": rows[0]["update"], "runs": runs, "times": times, **axes, "findings": findings}
 
 
 def capacity(rows: Sequence[Row], shipped: str) -> dict[str, Any]:
     """Facts of the sizes of the set network: a table, and how each size differs from the ``shipped`` one."""
-    sets = [key.removesuffix("/rate") for key in rows[0] if key.endswith("/rate")]
+    sets = validation_sets(rows)
     recipe = [row for row in rows if row["run"] == shipped]
-    lines, findings = [], []
+    findings = []
     for row in rows:
-        rates = [f"{percent(row, data)[0]:.1f}" for data in sets]
-        lines.append([f"`{row['run']}`", *rates])
         found = {data: compared([row], recipe, data) for data in sets}
         apart = ", ".join(f"{data} {text}" for data, text in found.items() if "overlap" not in text)
         if row not in recipe:
             findings.append(f"`{row['run']}`: {apart or 'all intervals overlap'}.")
-    table = markdown_table(["Network", *(f"{data} (%)" for data in sets)], lines)
-    return {"updates": updates_of(rows), "claim": claim("capacity"), "table": table, "findings": findings}
+    return {"updates": rows[0]["update"], "claim": claim("capacity"), "sets": sets, "runs": rows, "findings": findings}

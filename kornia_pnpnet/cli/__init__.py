@@ -1,8 +1,6 @@
-"""The command ``pnpnet``: one module per command.
+"""The command ``pnpnet``: one module per command, whose docstring is the help, and ``run`` returns the exit code.
 
-A command is a module in :data:`COMMANDS`. The docstring of the module is the command's help, and ``run(arguments)``
-returns the exit code. :data:`kornia_pnpnet.cli.arguments.ARGUMENTS` has the arguments of each command. The modules
-import PyTorch inside ``run``, because the import takes seconds and errors in arguments should appear at once.
+The modules import PyTorch inside ``run``, so that errors in arguments appear at once.
 """
 
 from __future__ import annotations
@@ -35,10 +33,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: arguments after ``pnpnet``; ``None`` means the arguments of the process.
+    """Run the command line with the arguments ``argv``, or with those of the process.
 
     Returns:
         The exit code: 0 for success, 1 when ``solve`` found no pose, 2 for bad input, 130 after an interruption.

@@ -107,7 +107,6 @@ of weights; solvers for another n are skipped; default: all installed solvers fo
 _DATA = f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic"
 _OUTLIERS = "none, uniform (0 to n/3 per problem), numbers or shares like 50%%, separated by commas"
 _MISMATCHES = "every outlier is the pixel of another point; default: half of the outliers, the others are random pixels"
-_DEMO_DATA = "a COLMAP model or an .npz file of matches instead of random problems"
 _DURATION = "approximate duration of the training; 0 skips the training"
 #: The arguments of each command.
 ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
@@ -152,7 +151,7 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "list": {},
     "demo": {
-        "--data": _arg(_DEMO_DATA, "FOLDER", type=_path),
+        "--data": _arg("a COLMAP model or an .npz file of matches instead of random problems", "FOLDER", type=_path),
         "--arbitrary-unit": _UNIT,
         "--out": _arg("where results and pictures go", "FOLDER", default="outputs/demo"),
         "--problems": _PROBLEMS,

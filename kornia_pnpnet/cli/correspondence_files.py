@@ -1,4 +1,4 @@
-"""Reading the correspondences and the camera of one image, and computing reprojection errors."""
+"""Read the correspondences and the camera of one image."""
 
 from __future__ import annotations
 
@@ -7,44 +7,30 @@ from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import is_zipfile
 
 import numpy as np
 import torch
-from kornia.geometry.conversions import convert_points_from_homogeneous
-from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from kornia_pnpnet.core.files import InputError, read_csv, read_npz
 from kornia_pnpnet.problem import MIN_PAIRS
-from kornia_pnpnet.result import Pose
 
-__all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays", "read_correspondences", "reproject"]
+__all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays", "read_correspondences"]
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
-_ZIP_MAGIC = b"PK\x03\x04"
 
 
 class ImageCorrespondences(NamedTuple):
-    r"""The correspondences of one image, in float64, or in float32 if all arrays of the file are float32.
+    """The correspondences of one image, in float64, or in float32 if all arrays of the file are float32."""
 
-    Attributes:
-        world_points: shape :math:`(N, 3)`.
-        img_points: pixels, shape :math:`(N, 2)`.
-        weights: at least 0, shape :math:`(N,)`, or ``None``.
-        intrinsics: camera matrix, shape :math:`(3, 3)`, or ``None``.
-    """
-
-    world_points: Tensor
-    img_points: Tensor
-    weights: Tensor | None = None
-    intrinsics: Tensor | None = None
+    world_points: Tensor  # (N, 3)
+    img_points: Tensor  # pixels, (N, 2)
+    weights: Tensor | None = None  # at least 0, (N,)
+    intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort the pixels, and use the intrinsics of the undistorted pinhole camera.
-
-        A pixel that cannot be undistorted gets the weight 0. For ``camera`` see
-        ``kornia_pnpnet.data.colmap.undistort``.
-        """
+        """Undistort the pixels of a camera, see ``kornia_pnpnet.data.colmap.undistort``; where impossible, weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -78,20 +64,12 @@ def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
-    """Read the correspondences of one image in the order of the file.
+    """Read a CSV file with the columns ``X,Y,Z,u,v`` and optionally ``weight``, or an NPZ file of the fields' names.
 
-    Args:
-        path: a CSV file or an NPZ file. A CSV file has the columns ``X,Y,Z,u,v`` and optionally ``weight``, in any
-            order; other columns are ignored. An NPZ file has the arrays ``world_points`` (N, 3), ``img_points`` (N, 2)
-            and optionally ``weights`` (N,) and ``intrinsics`` (3, 3).
-
-    Raises:
-        InputError: for fewer than three correspondences, a missing column or array, or an invalid number.
+    ``InputError`` for fewer than three correspondences, a missing column or array, or an invalid number.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        is_npz = path.suffix.lower() == ".npz" or file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC
-    read = _read_npz(path) if is_npz else _read_csv(path)
+    read = _read_npz(path) if path.suffix.lower() == ".npz" or is_zipfile(path) else _read_csv(path)
     if len(read.world_points) < MIN_PAIRS:
         raise InputError(path, f"a pose needs at least {MIN_PAIRS} correspondences, got {len(read.world_points)}")
     return read
@@ -145,17 +123,3 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
         if name not in arrays:
             raise InputError(path, f"no array {name}")
     return arrays
-
-
-def reproject(world_points: Tensor, img_points: Tensor, intrinsics: Tensor, pose: Pose) -> tuple[Tensor, Tensor]:
-    """Compute the reprojection errors of one image. ``pose`` is a batch of one pose.
-
-    Returns:
-        The reprojections (N, 2) and the reprojection errors (N,) in pixels; NaN for points that are not in front of the
-        camera.
-    """
-    cam_points = transform_points(pose.matrix, world_points[None])[0]
-    in_front = cam_points[:, 2:] > 0
-    pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
-    pixels = torch.where(in_front, pixels, torch.nan)
-    return pixels, (pixels - img_points).norm(dim=-1)

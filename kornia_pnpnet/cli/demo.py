@@ -76,16 +76,16 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
     """Draw the first problem with the most outliers. This choice does not depend on the solver."""
     import torch
 
-    from kornia_pnpnet.cli.correspondence_files import reproject
+    from kornia_pnpnet.cameras import reproject
     from kornia_pnpnet.evaluation.plots import plot_pose
 
     outliers = (~entry.problems.inliers).sum(-1)
     index = int(outliers.argmax())
-    world_points, img_points, intrinsics = (x[index] for x in entry.problems[:3])
+    world_points, img_points, intrinsics = (x[index : index + 1] for x in entry.problems[:3])
     with torch.no_grad():
-        result = solver(world_points[None], img_points[None], intrinsics[None])
-    pixels, _ = reproject(world_points, img_points, intrinsics, result.pose)
-    return plot_pose(path, img_points, pixels, ~result.inliers[0], f"{name}, {int(outliers[index])} outliers")
+        result = solver(world_points, img_points, intrinsics)
+    pixels, title = reproject(world_points, intrinsics, result.pose), f"{name}, {int(outliers[index])} outliers"
+    return plot_pose(path, img_points[0], pixels[0], ~result.inliers[0], title)
 
 
 def _train(seconds: float, folder: Path) -> Path | None:

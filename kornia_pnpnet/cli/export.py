@@ -22,18 +22,10 @@ def run(arguments: argparse.Namespace) -> int:
     target = Path(arguments.file)
     if target.suffix not in (".onnx", ".pt2"):
         raise ValueError(f"'{target}': the file's name must end in .onnx (ONNX) or .pt2 (compiled ahead of time)")
-    from kornia_pnpnet.export import (
-        INPUTS,
-        OUTPUTS,
-        RIG_INPUTS,
-        ExportedCamera,
-        check_packages,
-        export_onnx,
-        export_package,
-    )
+    from kornia_pnpnet import export
     from kornia_pnpnet.solver import PnPNet
 
-    check_packages(target.suffix)
+    export.check_packages(target.suffix)
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")
@@ -42,12 +34,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"'{target}' is a folder")
     if target.exists() and not arguments.overwrite:
         raise ValueError(f"'{target}' exists: pass --overwrite to replace it")
-    export, action = (export_onnx, "converting") if target.suffix == ".onnx" else (export_package, "compiling")
-    print(f"Tracing and {action}; PyTorch takes a minute or more", flush=True)
+    is_onnx = target.suffix == ".onnx"
+    print(f"Tracing and {'converting' if is_onnx else 'compiling'}; PyTorch takes a minute or more", flush=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # PyTorch's exporter warns about its own code
-        path = export(solver, target, arguments.n, batch=arguments.batch, rig=arguments.rig)
-    outputs = OUTPUTS if solver.focal == "known" else ExportedCamera._fields
-    inputs = RIG_INPUTS if arguments.rig else INPUTS
+        write = export.export_onnx if is_onnx else export.export_package
+        path = write(solver, target, arguments.n, batch=arguments.batch, rig=arguments.rig)
+    outputs = export.OUTPUTS if solver.focal == "known" else export.ExportedCamera._fields
+    inputs = export.RIG_INPUTS if arguments.rig else export.INPUTS
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(inputs)} -> {', '.join(outputs)}")
     return 0

@@ -25,27 +25,18 @@ SUFFIXES = (".npz", ".parquet")
 
 # Key in the metadata of a results file. The value has the name of the solver and the digest of its parameters.
 _SOLVER = b"kornia_pnpnet.solver"
-# Largest number of values that are read from a Parquet file at once: 256 MB in float64. For large problems this limit
-# reduces the rows of a batch.
+# Largest number of values that are read from a Parquet file at once: 256 MB in float64.
 _NUMBERS_AT_ONCE = 2**25
 
 
 class ShardReport(NamedTuple):
-    """Result of :func:`solve_shards`.
+    """Result of :func:`solve_shards`."""
 
-    Attributes:
-        solved: number of problems with a pose, in the shards of this call.
-        problems: number of all problems in the shards of this call.
-        shards: number of shards that this call solved.
-        kept: number of shards that were skipped because they have results.
-        failed: one error message for each shard that cannot be read.
-    """
-
-    solved: int
-    problems: int
-    shards: int
-    kept: int
-    failed: list[str]
+    solved: int  #: Number of problems with a pose, in the shards of this call.
+    problems: int  #: Number of all problems in the shards of this call.
+    shards: int  #: Number of shards that this call solved.
+    kept: int  #: Number of shards that were skipped because they have results.
+    failed: list[str]  #: One error message for each shard that cannot be read.
 
 
 def solve_shards(
@@ -60,20 +51,19 @@ def solve_shards(
 ) -> ShardReport:
     r"""Solve shards of problems one after the other. The results of the shard ``part.*`` go to ``part.parquet``.
 
-    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. At most ``batch``
-    rows are read at a time. An NPZ shard is read as a whole and has the arrays ``world_points`` (B, N, 3) and
-    ``img_points`` (B, N, 2). Optional arrays are ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma``
-    and ``world_sigma``. Each sigma has the shape (), (B,) or (B, N).
+    A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. An NPZ shard is read
+    as a whole. It has arrays of the same names, ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally
+    ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma`` and ``world_sigma`` of (), (B,) or (B, N).
 
-    A results file appears when it is complete. A repeated call skips the shards that have results. A shard that cannot
-    be read is reported, and the other shards are solved.
+    A results file appears when it is complete. A repeated call skips the shards that have results. Shards that cannot
+    be read are reported.
 
     Args:
         solve: the solver.
         sources: shards, or folders of shards.
         out: folder of the results, without shards.
         name: name of the solver. Results files store this name and the digest of the solver's parameters.
-        batch: largest number of problems that are solved at once.
+        batch: largest number of problems that are read and solved at once.
         overwrite: also solve the shards that have results.
         progress: show a progress bar if stderr is a terminal and tqdm is installed.
 
@@ -105,7 +95,7 @@ def solve_shards(
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
-    """Find all shards. The keys are the stems of their names. Shards of a folder are sorted by name."""
+    """Find all shards by the stems of their names. Shards of a folder are sorted by name."""
     shards: dict[str, Path] = {}
     endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):
@@ -125,7 +115,7 @@ def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
 
 
 def _solver_of(target: Path) -> bytes | None:
-    """Read the metadata entry ``_SOLVER`` of a file; ``None`` when the file is not a results file."""
+    """The metadata entry ``_SOLVER`` of a file; ``None`` when the file is not a results file."""
     with suppress(pa.ArrowException, OSError):
         return (parquet.read_schema(target).metadata or {}).get(_SOLVER)
     return None
@@ -165,8 +155,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
     """Yield tables of at most ``batch`` rows from a Parquet file. An empty file yields one empty table."""
     try:
-        # With pre_buffer Arrow would read ahead to the end of the file. Without buffer_size, Arrow would read a whole
-        # row group at once.
+        # With pre_buffer Arrow would read ahead to the end of the file; without buffer_size, whole row groups.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
             groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
             numbers = [sum(x.column(i).num_values for i in range(x.num_columns)) // max(x.num_rows, 1) for x in groups]

@@ -97,7 +97,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     import torch
 
     from kornia_pnpnet import Status, diagnose
-    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences, reproject
+    from kornia_pnpnet.cameras import reproject
+    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences
 
     (path,), name, plot = arguments.file, arguments.solver, arguments.plot
     matches = read_correspondences(path)
@@ -120,8 +121,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         uncertain = {"focal": focal, "focal_sigma": getattr(solver, "focal_sigma", None)}
         covariance = result.covariance(*pairs, result.intrinsics, **uncertain)
     camera, ok, status = result.intrinsics[0], bool(result.ok), Status(int(result.status)).name.lower()
-    pixels, errors = reproject(world_points, img_points, camera, result.pose)
-    limit = arguments.threshold
+    pixels = reproject(world_points, camera, result.pose)[0]
+    errors, limit = (pixels - img_points).norm(dim=-1), arguments.threshold
     rejected = ~(result.inliers[0] if limit is None else errors <= limit) | ~result.ok  # without a pose all pairs
     deviations = torch.where(result.ok, covariance[0].diagonal().sqrt(), torch.nan)
     answer = {
@@ -155,7 +156,13 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         from kornia_pnpnet.evaluation.plots import plot_pose
 
         plot_pose(plot, img_points, pixels, rejected, name if ok else f"{name}: NOT SOLVED")
-    doubts = _doubts(answer, int(used.sum())) if status in ("solved", "not_believed") else []
+    doubts = []
+    if status in ("solved", "not_believed"):
+        inliers, count, sigma = int(result.inliers.sum()), int(used.sum()), result.sigma.item()
+        if inliers < _LEAST_SHARE * count:
+            doubts.append(f"only {inliers} of {count} correspondences agree with the pose")
+        if sigma > _MOST_NOISE_PX:
+            doubts.append(f"the inliers show {sigma:.3g} px of noise, more than {_MOST_NOISE_PX:g}")
     reason = f"{' and '.join(doubts)}: {_MISTAKES}" if doubts else _ADVICE.get(status)
     if reason:
         print(f"pnpnet: {reason}" if ok else f"pnpnet: not solved ({status}): {reason}", file=sys.stderr)
@@ -165,14 +172,6 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
 def _finite(values: Tensor) -> list[float | None]:
     """A list for JSON, with ``None`` in place of numbers that are not finite."""
     return [value if math.isfinite(value) else None for value in values.tolist()]
-
-
-def _doubts(answer: dict[str, Any], count: int) -> list[str]:
-    """The tests of plausibility that an answer fails; ``count`` correspondences have a weight."""
-    inliers, sigma = answer["inliers"], answer["sigma_px"]
-    few = [f"only {inliers} of {count} correspondences agree with the pose"] if inliers < _LEAST_SHARE * count else []
-    noisy = sigma > _MOST_NOISE_PX
-    return few + ([f"the inliers show {sigma:.3g} px of noise, more than {_MOST_NOISE_PX:g}"] if noisy else [])
 
 
 def _table(answer: dict[str, Any], rvec_deg: list[float]) -> str:

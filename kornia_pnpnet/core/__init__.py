@@ -1,1 +1,1 @@
-"""Internal foundations of the package: checks, linear algebra, compilation, files, schemas."""
+"""Internal foundations of the package, not public: checks, linear algebra, compilation, files, schemas."""

@@ -8,22 +8,9 @@ from numbers import Integral, Real
 from typing import Any, TypeAlias
 
 import torch
-from kornia.core.check import KORNIA_CHECK
+from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
 from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError
 from torch import Tensor
-
-__all__ = [
-    "Shapes",
-    "check_devices",
-    "check_like",
-    "check_numbers",
-    "check_positive",
-    "check_ranges",
-    "check_shapes",
-    "check_whole",
-    "common_dtype",
-    "expand_sigma",
-]
 
 #: Maps the name of each argument to its tensor and its expected shape. A tensor that is ``None`` is not checked.
 Shapes: TypeAlias = dict[str, tuple[Tensor | None, tuple[int, ...]]]
@@ -35,10 +22,7 @@ def _is_number(value: Any) -> bool:
 
 
 def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
-    """Raise ``BaseError`` unless each value is an integer from ``least`` to ``most``.
-
-    ``most=None`` means that there is no upper bound. NumPy integers pass, booleans do not.
-    """
+    """Raise ``BaseError`` unless each value is an integer, also NumPy's, from ``least`` to ``most`` (``None``: any)."""
     bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     for name, value in values.items():
         whole = isinstance(value, Integral) and not isinstance(value, bool)
@@ -56,7 +40,7 @@ def check_numbers(low: float, high: float = math.inf, /, **values: Any) -> None:
 def check_positive(*, or_infinite: bool = False, **values: Any) -> None:
     """Raise ``BaseError`` unless each value is a positive, finite number. ``or_infinite`` also allows infinity."""
     for name, value in values.items():
-        positive = (_is_number(value) and value > 0) or (or_infinite and value == math.inf)
+        positive = (_is_number(value) and value > 0) or (or_infinite and isinstance(value, Real) and value == math.inf)
         KORNIA_CHECK(positive, f"{name} must be a positive number, got {value!r}.")
 
 
@@ -68,11 +52,23 @@ def check_ranges(**values: Any) -> None:
         KORNIA_CHECK(in_order, f"{name} must be two positive numbers, the second not smaller, got {value!r}.")
 
 
-def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
-    """Raise ``ShapeError`` when a tensor does not have its expected shape.
+def check_tensors(tensors: Mapping[str, Any]) -> None:
+    """Raise ``TypeCheckError`` when a value is not a tensor. Entries of ``None`` are skipped."""
+    for name, value in tensors.items():
+        if value is not None and not isinstance(value, Tensor):
+            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
 
-    If the world points are given as ``like``, the error message also names their shape.
-    """
+
+def check_form(form: list[str], **tensors: Tensor) -> None:
+    """Raise an error unless each value is a tensor with the shape ``form`` of ``KORNIA_CHECK_SHAPE``."""
+    check_tensors(tensors)
+    for name, tensor in tensors.items():
+        KORNIA_CHECK_SHAPE(tensor, form, f"Argument: {name}")
+
+
+def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
+    """Raise an error for a value that is no tensor or has another shape. The message names the shape of ``like``."""
+    check_tensors({name: tensor for name, (tensor, _) in shapes.items()})
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
             beside = "" if like is None else f" to go with world_points of {tuple(like.shape)}"
@@ -82,12 +78,7 @@ def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
 
 
 def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise an error when a tensor has another dtype or device than ``like``. Entries of ``None`` are skipped.
-
-    Raises:
-        TypeCheckError: when the dtypes differ.
-        DeviceError: when the devices differ.
-    """
+    """Raise an error when a tensor has another dtype or device than ``like``. Entries of ``None`` are skipped."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.dtype != like.dtype:
             raise TypeCheckError(f"{name} is {tensor.dtype} but {like_name} is {like.dtype}.")
@@ -117,15 +108,9 @@ def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
 
 
 def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:
-    """Check the type, device and shape of a standard deviation, and expand it to every pair.
+    """Check a standard deviation, and expand it to (*, N) in the dtype of world points (*, N, 3).
 
-    Args:
-        name: name of the argument in error messages.
-        sigma: a number or a tensor of shape (), (*) or (*, N); ``None``: unknown.
-        world_points: shape (*, N, 3).
-
-    Returns:
-        Shape (*, N), in the dtype of the world points; NaN if ``sigma`` is ``None``.
+    ``sigma`` is a number or has the shape (), (*) or (*, N). ``None`` becomes NaN. Errors call it ``name``.
     """
     pairs = world_points.shape[:-1]
     if sigma is None or isinstance(sigma, int | float):

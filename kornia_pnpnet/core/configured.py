@@ -1,4 +1,4 @@
-"""Modules that remember the arguments of their constructor, for configuration files and for ``repr``."""
+"""Modules that remember the arguments of their constructor."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from numbers import Integral
 from typing import Any
 
 from torch import nn
-
-__all__ = ["Configured"]
 
 
 class Configured(nn.Module):

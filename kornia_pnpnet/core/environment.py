@@ -13,8 +13,6 @@ from typing import Any
 
 import torch
 
-__all__ = ["environment", "peak_resident_bytes"]
-
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
 # Distributions of OpenCV on PyPI, the most common distribution first.
 _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["how_to_install", "needs"]
-
 
 def how_to_install(extra: str) -> str:
     """Return the command that installs an extra. No package index has this library yet."""
@@ -15,14 +13,7 @@ def how_to_install(extra: str) -> str:
 
 @contextmanager
 def needs(extra: str, message: str) -> Iterator[None]:
-    """Import packages of an extra.
-
-    Args:
-        extra: key of the optional dependencies in ``pyproject.toml``.
-        message: what needs which packages, as the first part of an error message.
-
-    Raises:
-        ImportError: when an import in the block fails. The message names the command that installs the extra.
+    """Import packages of an extra. The message of an ``ImportError`` also names the command that installs the extra.
 
     Example:
         >>> with needs("eval", "Pictures need matplotlib"):

@@ -17,18 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["MOST_BYTES", "InputError", "atomic_open", "digest", "read_csv", "read_npz", "write_json"]
-
-#: Bytes. :func:`read_npz` refuses files whose arrays exceed this size in total. A compressed file of a few megabytes
-#: can contain gigabytes.
+#: Bytes. Largest total size of arrays of :func:`read_npz`: a compressed file of a few megabytes can contain gigabytes.
 MOST_BYTES = 2**31
 
 
 class InputError(ValueError):
-    """An input file or a command-line option cannot be used.
-
-    The message is one line. The line begins with the file or option and, for text files, the line number.
-    """
+    """An input file or a command-line option cannot be used. The message is one line that begins with its place."""
 
     def __init__(self, source: str | Path, message: str, line: int | None = None) -> None:
         place = source if line is None else f"{source}:{line}"
@@ -37,11 +31,7 @@ class InputError(ValueError):
 
 @contextmanager
 def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
-    """Open a temporary file for writing, and rename the complete file to ``path``.
-
-    If the process is killed or the disk is full, an existing file at ``path`` does not change. Missing folders are
-    made.
-    """
+    """Open a temporary file for writing, and rename the complete file to ``path``. Missing folders are made."""
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -58,11 +48,7 @@ def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[I
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write an indented JSON file by :func:`atomic_open`.
-
-    Raises:
-        ValueError: when a number is not finite.
-    """
+    """Write an indented JSON file by :func:`atomic_open`. ``ValueError``: a number is not finite."""
     with atomic_open(path, encoding="utf-8") as file:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
@@ -96,11 +82,7 @@ def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] =
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read arrays of an NPZ file, without unpickling.
-
-    Args:
-        path: the NPZ file.
-        names: names of the arrays to read; ``None``: all arrays. Names that the file lacks are ignored.
+    """Read the named arrays of an NPZ file that the file has, ``None``: all, without unpickling.
 
     Raises:
         ValueError: when the file is not an NPZ file of numbers, or when the arrays take more than :data:`MOST_BYTES`.
@@ -121,10 +103,9 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.n
 
 
 def digest(*parts: Any) -> str:
-    """Compute one hexadecimal SHA-256 digest of the concatenated parts.
+    """Compute one hexadecimal SHA-256 digest of the concatenated parts: tensors, strings, bytes, and data as JSON.
 
-    The digest of a tensor depends on dtype, shape and values, not on the device. Strings and bytes are digested
-    directly. All other data are first converted to JSON with sorted keys.
+    The digest of a tensor depends on dtype, shape and values, not on the device.
     """
     sha = hashlib.sha256()
     for part in parts:

@@ -1,7 +1,4 @@
-"""Reading and checking of JSON files. An error names the file and the first invalid entry.
-
-This module needs pydantic, which only the extras install. ``import kornia_pnpnet`` must therefore not load this module.
-"""
+"""Reading and checking of JSON files by pydantic, which only the extras install."""
 
 from __future__ import annotations
 
@@ -12,8 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
-
-__all__ = ["STRICT", "Count", "Kept", "Positive", "Share", "read_json", "to_json"]
 
 _T = TypeVar("_T")
 
@@ -39,15 +34,9 @@ Kept = WrapValidator(_keep)
 def read_json(path: str | Path, kind: type[_T], what: str) -> _T:
     """Read a JSON file, and check its content against a type that pydantic supports.
 
-    Args:
-        path: the JSON file.
-        kind: the expected type of the content.
-        what: description of the expected file in error messages, for example "a results file".
-
     Raises:
-        FileNotFoundError: when the file does not exist.
-        ValueError: when the content does not have the expected type. The message ends with the first invalid entry, for
-            example: "'a.json' is not a results file: rows[0].success.rate is missing".
+        ValueError: when the content does not have the type. The message names ``what`` was expected, and the first
+            invalid entry: "'a.json' is not a results file: rows[0].success.rate is missing".
     """
     try:
         return TypeAdapter(kind).validate_json(Path(path).read_bytes(), strict=True)

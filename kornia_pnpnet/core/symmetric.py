@@ -10,8 +10,6 @@ from torch import Tensor
 
 from kornia_pnpnet.core.linalg import factorise
 
-__all__ = ["Symmetric2", "Symmetric3", "are_semi_definite", "equivalent_sigma"]
-
 # Units in the last place of the trace. An eigenvalue counts as negative only if it is below minus this bound.
 _ROUNDING = 16.0
 # Units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the determinant would
@@ -44,21 +42,15 @@ class Symmetric2(NamedTuple):
         return torch.addcmul(cross * u, self.vv * v, v)
 
     def inverse(self) -> Symmetric2:
-        """The inverse of a positive definite matrix, computed with the bounded :attr:`determinant`.
-
-        Example:
-            >>> Symmetric2(*torch.tensor([2.0, 1.0, 1.0])).inverse()
-            Symmetric2(uu=tensor(1.), uv=tensor(-1.), vv=tensor(2.))
-        """
+        """The inverse of a positive definite matrix, computed with the bounded :attr:`determinant`."""
         scale = self.determinant.reciprocal()
         return Symmetric2(self.vv * scale, -self.uv * scale, self.uu * scale)
 
-    def mapped(self, a: Tensor, b: Tensor, d: Tensor, c: Tensor | None = None) -> Symmetric2:
-        """The covariance A S Aᵀ, where S is this covariance and A is [[a, b], [c, d]]. ``None`` for c means 0."""
+    def mapped(self, a: Tensor, b: Tensor, d: Tensor, c: Tensor | float = 0.0) -> Symmetric2:
+        """The covariance A S Aᵀ, where S is this covariance and A is [[a, b], [c, d]]."""
         u, v = a * self.uu + b * self.uv, a * self.uv + b * self.vv
-        if c is None:
-            return Symmetric2(a * u + b * v, d * v, d * d * self.vv)
-        return Symmetric2(a * u + b * v, c * u + d * v, c * (c * self.uu + 2.0 * d * self.uv) + d * d * self.vv)
+        s, t = c * self.uu + d * self.uv, c * self.uv + d * self.vv
+        return Symmetric2(a * u + b * v, c * u + d * v, c * s + d * t)
 
     def at_least(self, least: float) -> Symmetric2:
         """Raise the smallest eigenvalue to at least ``least`` by adding a multiple of the identity."""
@@ -85,7 +77,9 @@ class Symmetric3(NamedTuple):
 
     def divided(self, length: Tensor) -> Symmetric3:
         """Divide lengths by a length, and add a multiple of the identity that exceeds the entries' rounding errors."""
-        xx, xy, xz, yy, yz, zz = (x / length / length for x in self)
+        # An entry of 0 gives the length no gradient. If the square of the length underflows, it would be NaN.
+        lengths = (torch.where(x == 0, length.detach(), length) for x in self)
+        xx, xy, xz, yy, yz, zz = (x / unit / unit for x, unit in zip(self, lengths, strict=True))
         more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()
         return Symmetric3(xx + more, xy, xz, yy + more, yz, zz + more)
 
@@ -110,12 +104,7 @@ def _lower_rows(matrix: Symmetric2 | Symmetric3) -> list[list[Tensor]]:
 
 
 def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
-    """Tell whether matrices are finite and positive semi-definite up to rounding, bool, with the shape of an entry.
-
-    Example:
-        >>> are_semi_definite(Symmetric2(torch.tensor([1.0, 1.0, 0.0]), torch.tensor([1.0, 2.0, 0.0]), torch.ones(3)))
-        tensor([ True, False,  True])
-    """
+    """Tell whether matrices are finite and positive semi-definite up to rounding, bool, with the shape of an entry."""
     rows = [[x.detach() for x in row] for row in _lower_rows(matrix)]
     trace = torch.stack([row[-1] for row in rows]).sum(0)
     limits = torch.finfo(trace.dtype)

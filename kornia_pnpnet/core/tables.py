@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-__all__ = ["markdown_table"]
-
 
 def markdown_table(
     header: Sequence[str], rows: Iterable[Sequence[str]], *, align: str | None = None, pad: bool = False
 ) -> str:
-    """Write a Markdown table.
+    """Write a Markdown table. With ``pad``, the columns line up in a terminal.
 
-    Args:
-        header: titles of the columns.
-        rows: rows of cells, one cell for each column.
-        align: ``l`` (left) or ``r`` (right) for each column; ``None``: the first column left, all others right.
-        pad: pad the cells with spaces, so that the columns line up in a terminal.
+    ``align`` has ``l`` (left) or ``r`` (right) for each column; ``None``: the first column left, all others right.
 
     Example:
         >>> print(markdown_table(["solver", "µs"], [["epnp", "7"], ["p3p-ransac", "120"]], pad=True))

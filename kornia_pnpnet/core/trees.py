@@ -7,22 +7,13 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-__all__ = ["iter_tensors", "map_tensors", "put", "take"]
-
 _T = TypeVar("_T")
 
 
 def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
-    """Apply a function to every tensor of nested tuples.
+    """Apply a function to every tensor of nested tuples, named tuples and lists. Other values, as ``None``, stay.
 
-    Args:
-        function: receives one tensor from each tree, all from the same position.
-        tree: a tensor, or a tuple, named tuple or list of trees. Any other value, such as ``None``, is returned
-            unchanged.
-        others: more trees of the same structure.
-
-    Returns:
-        A tree of the same structure with the results of the function.
+    With ``others``, trees of the same structure, the function receives one tensor from each tree.
 
     Example:
         >>> import torch

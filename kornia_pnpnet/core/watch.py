@@ -9,8 +9,6 @@ from torch import Tensor
 
 from kornia_pnpnet.core.performance import sees_values
 
-__all__ = ["GradientWatch"]
-
 # Calls. The first batches of a training show whether it can learn; later calls cost nothing.
 _CALLS = 8
 
@@ -19,21 +17,18 @@ class GradientWatch:
     """Warn once if no problem of the first 8 batches that need a gradient is ``ok``. Reads values in one call only."""
 
     def __init__(self) -> None:
-        self._left = _CALLS
-        self._solved: Tensor | None = None
+        self._solved: list[Tensor] = []
 
     def see(self, ok: Tensor, *inputs: Tensor | None) -> None:
         """Look at ``ok`` of a batch, bool, any shape, and at whether any of the inputs requires a gradient."""
-        if self._left == 0 or not torch.is_grad_enabled() or not any(x is not None and x.requires_grad for x in inputs):
+        learns = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
+        # A wrapped tensor must not outlive its transform. A CUDA graph cannot contain the reading of a value.
+        readable = sees_values(ok) and not torch._C._functorch.is_functorch_wrapped_tensor(ok)
+        readable = readable and not (ok.is_cuda and torch.cuda.is_current_stream_capturing())
+        if len(self._solved) == _CALLS or not (learns and readable and ok.numel()):
             return
-        # A wrapped tensor must not outlive its transform.
-        if not ok.numel() or not sees_values(ok) or torch._C._functorch.is_functorch_wrapped_tensor(ok):
-            return
-        self._left -= 1
-        self._solved = ok.any() if self._solved is None else self._solved | ok.any()
-        if self._left:
-            return
-        if not self._solved:
+        self._solved.append(ok.any())
+        if len(self._solved) == _CALLS and not torch.stack(self._solved).any():
             warnings.warn(
                 f"No problem of the first {_CALLS} batches is ok, and only problems that are ok have a gradient: "
                 "nothing can be learned from these poses. Start with the loss monte_carlo_pose_loss (how to: Train "
@@ -41,4 +36,3 @@ class GradientWatch:
                 RuntimeWarning,
                 stacklevel=3,
             )
-        self._solved = None

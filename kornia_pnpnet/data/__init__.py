@@ -1,8 +1,7 @@
 """Sources of problems: synthetic problems and real scenes.
 
-A source is a class with ``batch_size`` and ``batch(index)``. The modules ``synthetic``, ``cameras``, ``mixtures`` and
-``scenes`` contain sources. ``points``, ``outliers`` and ``draws`` draw points, outliers and poses. ``colmap`` reads
-scenes from files. ``stream`` draws batches in worker processes.
+A source is a class with ``batch_size`` and ``batch(index)``. Constructors raise ``BaseError`` for a number or a range
+out of its bounds.
 """
 
 from kornia_pnpnet.data.cameras import CameraProblems

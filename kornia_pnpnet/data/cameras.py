@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
-from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data.draws import RandomProblems, log_uniform, normal, random_poses, uniform, unit
 from kornia_pnpnet.result import Pose, Problems
 
@@ -44,9 +42,6 @@ class CameraProblems(RandomProblems):
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
         cameras: number of cameras. Two or more cameras form a rig, and batches then have ``cam_from_rig``.
         baseline: distance of the camera centres from the origin of the rig, relative to the mean depth.
-
-    Raises:
-        BaseError: for a number out of its bounds.
 
     Example:
         >>> problems = CameraProblems(n=12, batch_size=2, seed=1, outlier_share=0.25, cameras=3).batch(0)
@@ -84,7 +79,12 @@ class CameraProblems(RandomProblems):
         points = torch.cat((pixels * (depth / focal)[..., None], depth[..., None]), -1)
         rig = None
         if self.cameras > 1:
-            rig = map_tensors(lambda x: x[:, camera], self._rig(distance, generator))
+            heading = torch.arange(self.cameras).double()[:, None] * (2.0 * math.pi / self.cameras)
+            rotation = axis_angle_to_rotation_matrix(pad(heading, (1, 1))).expand(self.batch_size, -1, -1, -1)
+            direction = normalize(normal((self.batch_size, self.cameras, 3), generator), dim=-1)
+            centre = self.baseline * distance[..., None] * direction  # (B, C, 3)
+            translation = -(rotation @ centre[..., None])[..., 0]
+            rig = Pose(rotation[:, camera], translation[:, camera])
             points = (rig.rotation.mT @ (points - rig.translation)[..., None])[..., 0]
         pose = random_poses(self.batch_size, generator, translation_box=1.0, max_angle=math.pi)
         pose = pose._replace(translation=distance * pose.translation)
@@ -97,10 +97,3 @@ class CameraProblems(RandomProblems):
         intrinsics[..., 0, 0] = intrinsics[..., 1, 1] = focal
         intrinsics[..., :2, 2] = _HALF_IMAGE
         return Problems(world_points, pixels, intrinsics if rig else intrinsics[:, 0], pose, inliers, cam_from_rig=rig)
-
-    def _rig(self, distance: Tensor, generator: torch.Generator) -> Pose:
-        """Draw the transform from the rig's frame to the frame of each camera, (B, C, 3, 3) and (B, C, 3)."""
-        heading = torch.arange(self.cameras).double()[:, None] * (2.0 * math.pi / self.cameras)
-        rotation = axis_angle_to_rotation_matrix(pad(heading, (1, 1))).expand(self.batch_size, -1, -1, -1)
-        centres = normalize(normal((self.batch_size, self.cameras, 3), generator), dim=-1)
-        return Pose(rotation, -(rotation @ (self.baseline * distance[..., None] * centres)[..., None])[..., 0])

@@ -24,10 +24,9 @@ _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
     """Load a scene from a COLMAP model, or from a file of unfiltered 2D-3D matches with the true poses.
 
-    ``pycolmap`` reads a model in text or binary format. The model is in the folder ``path`` or in its sub-folder
-    ``dslr_calibration_undistorted`` (ETH3D), ``sparse/0`` or ``sparse`` (COLMAP). Pixels of distorted cameras are
-    undistorted to the pinhole camera with the same focal length and principal point. If an image observes a point
-    twice, the first pixel is used. Points behind the camera are dropped. All pairs of a model count as inliers.
+    The model is in the folder ``path`` or in its sub-folder ``dslr_calibration_undistorted`` (ETH3D), ``sparse/0`` or
+    ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image observes a
+    point twice, the first pixel is used. Points behind the camera are dropped. All pairs of a model count as inliers.
 
     A file of matches is an ``.npz`` file of V images. The file has the arrays ``names`` (V,), ``K`` (V, 3, 3),
     ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2), which is width and height. All other names start with the index

@@ -39,9 +39,6 @@ class DepthMaps:
         flying_share: probability that a point is a flying pixel.
         maps: number of map cameras of a problem.
 
-    Raises:
-        BaseError: for a number or a range out of its bounds.
-
     Example:
         >>> points = torch.tensor([[[0.0, 0.0, 4.0], [1.0, 0.0, 5.0]]], dtype=torch.float64)
         >>> moves, is_flying = DepthMaps(flying_share=0.0)(points, torch.Generator().manual_seed(0))
@@ -70,7 +67,7 @@ class DepthMaps:
         size = cam_points.norm(dim=-1).mean(1)[:, None, None]  # (B, 1, 1)
         centre = _BASELINE * size * normal((batch_size, self.maps, 3), generator)
         turn = log_uniform((batch_size, 1, 1), *self.angle, generator).deg2rad() * normal(centre.shape, generator)
-        of_map = (self.maps * unit(each, generator)).long().clamp(max=self.maps - 1)
+        of_map = (self.maps * unit(each, generator)).long()
         ray = cam_points - centre.take_along_dim(of_map, 1)
         sigma = log_uniform((batch_size, 1, 1), *self.depth_noise, generator)
         change = sigma * ray.norm(dim=-1, keepdim=True) / size * normal(each, generator)  # relative to the distance

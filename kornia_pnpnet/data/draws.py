@@ -48,10 +48,8 @@ class RandomProblems:
 
 
 def batch_generator(seed: int, index: int) -> torch.Generator:
-    """Make the random generator of a batch; equal arguments give equal random numbers.
-
-    ``seed`` and ``index`` are hashed into one number, because CPU generators use only 32 bits of their seed.
-    """
+    """Make the random generator of a batch; equal arguments give equal random numbers."""
+    # Seed and index are hashed into one number, because CPU generators use only 32 bits of their seed.
     state = int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0])
     return torch.Generator().manual_seed(state >> 1)
 
@@ -87,8 +85,8 @@ def random_poses(
     """Draw world-to-camera poses of the protocol.
 
     The axis of the rotation has a uniform direction, and the angle is uniform from 0 to ``max_angle`` radians. The
-    translation is uniform in a cube of side ``translation_box`` about 0 if ``translation_sigma`` is ``None``. Otherwise
-    the translation is normal with the standard deviation ``translation_sigma`` on each axis.
+    translation is uniform in a cube of side ``translation_box`` about 0, or normal with the standard deviation
+    ``translation_sigma`` on each axis.
     """
     axis = normalize(normal((batch_size, 3), generator), dim=-1)
     angle = uniform((batch_size, 1), 0.0, max_angle, generator)

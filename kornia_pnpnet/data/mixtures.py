@@ -12,7 +12,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_whole
+from kornia_pnpnet.core.checks import check_whole, expand_sigma
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data.draws import batch_generator, unit
 from kornia_pnpnet.data.points import PointPrior
@@ -38,8 +38,7 @@ class MixedProblems:
         options: further arguments of all constructors.
 
     Raises:
-        BaseError: when the numbers of shares and sources differ, or a share is not positive. ``batch`` raises this
-            error when only some sources give covariances.
+        BaseError: by ``batch``, when only some sources give covariances.
 
     Example:
         >>> from functools import partial
@@ -102,10 +101,8 @@ def _joined(parts: list[Problems], name: str) -> Tensor | None:
     dimensions = max((value.ndim for value in known if value is not None), default=0)
     if not dimensions:
         return None
-    for i, part in enumerate(parts):
-        value = part.world_points.new_full((len(part.inliers),), torch.nan) if known[i] is None else known[i]
-        known[i] = value if value.ndim == dimensions else value[:, None].expand(part.inliers.shape)
-    return torch.cat(known)
+    joined = torch.cat([expand_sigma(name, x, part.world_points) for x, part in zip(known, parts, strict=True)])
+    return joined if dimensions > 1 else joined[:, 0]
 
 
 class MixedPoints:
@@ -113,11 +110,7 @@ class MixedPoints:
 
     Args:
         priors: the priors.
-        shares: one positive number per prior. The number of problems of a prior is proportional to its share. ``None``
-            means equal shares.
-
-    Raises:
-        BaseError: when the numbers of shares and priors differ, or a share is not positive.
+        shares: one positive number per prior, as in :class:`MixedProblems`.
 
     Example:
         >>> from kornia_pnpnet.data import BoxPoints, SlabPoints, SyntheticProblems
@@ -143,16 +136,11 @@ class MixedPoints:
 class VaryingSize:
     """Batches that differ in the number of pairs per problem, but hardly in the total number of pairs.
 
-    Worker processes cannot draw batches of different shapes, so training needs ``data_workers=0``.
-
     Args:
         source: constructor of a source, called with ``n``, ``batch_size`` and ``seed``.
         n: numbers of pairs per problem. Each batch draws one of these numbers.
         batch_size: number of problems in a batch with the smallest ``n``. Other batches have fewer problems.
         seed: seed of the stream.
-
-    Raises:
-        BaseError: when ``n`` is empty or has a number below 1.
 
     Example:
         >>> source = VaryingSize(SyntheticProblems, n=(4, 8), batch_size=6)

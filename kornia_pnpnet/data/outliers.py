@@ -66,9 +66,6 @@ class OutlierMix:
         max_crowds: largest number of crowds. Each problem draws its number uniformly from 1 to ``max_crowds``.
         point_crowd_share: probability that all crowds of a problem have the leaders' world points, not their pixels.
 
-    Raises:
-        BaseError: for a number or a range out of its bounds.
-
     Example:
         >>> OutlierMix().max_count(9), OutlierMix(max_ratio=0.33).max_count(9), OutlierMix(count=2).max_count(9)
         (3, 3, 2)
@@ -169,7 +166,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
 
 def crowd_leaders(batch_size: int, n: int, max_crowds: int, generator: torch.Generator) -> Tensor:
     """Draw the index of the leader of each pair, (B, N). Only pairs of a crowd use their leader."""
-    leader = (n * unit((batch_size, max_crowds), generator)).long().clamp(max=n - 1)  # (B, max_crowds)
+    leader = (n * unit((batch_size, max_crowds), generator)).long()  # (B, max_crowds)
     crowds = 1 + (max_crowds * unit((batch_size, 1), generator)).long()  # (B, 1)
-    crowd = (crowds * unit((batch_size, n), generator)).long().clamp(max=max_crowds - 1)
+    crowd = (crowds * unit((batch_size, n), generator)).long()
     return leader.gather(1, crowd)

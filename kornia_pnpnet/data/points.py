@@ -1,8 +1,6 @@
 """Priors of points in the camera's frame: the protocol's box, slabs, objects, façades, rooms, drives.
 
 A new prior is a class with the method ``__call__`` of :class:`PointPrior`. An argument of two numbers is a range.
-Constructors raise ``BaseError`` for a number out of its bounds, and for a range whose second number is smaller than the
-first.
 """
 
 from __future__ import annotations
@@ -42,8 +40,6 @@ _ROOM_SIDE, _ROOM_HEIGHT, _FURNITURE, _NEAREST = (2.0, 15.0), (2.2, 5.0), 4, 0.1
 _CAMERA_HEIGHT, _STREET_SIDE, _STREET_END = (1.0, 3.0), (2.5, 20.0), (30.0, 200.0)
 # Drives: standard deviation of the yaw in degrees, share of points on cars and trees, height of an invisible ceiling.
 _YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
-# Smallest divisor in `_hits`. A ray parallel to a wall then meets the wall far away and not at infinity.
-_PARALLEL = 1e-9
 # Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
 
@@ -225,6 +221,5 @@ class DrivePoints(_View):
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Multiples of ``rays``, (..., 3), where the rays enter and leave a box. If enter >= leave, a ray misses."""
-    rays = torch.where(rays.abs() < _PARALLEL, _PARALLEL, rays)
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)

@@ -96,9 +96,9 @@ class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
     Each problem consists of ``n`` random points of a random image and their pixels. The pixel of a *mismatch* is the
-    pixel of a spare point of the same image. The pixel of a *sensing* outlier is uniform in the image. Every other pair
-    that is an inlier of its image is an inlier of the problem. ``outliers=OutlierMix(count=2)`` is the protocol's real
-    data with outliers. Points and poses do not depend on ``outliers``.
+    pixel of a spare point of the same image. Every other pair that is an inlier of its image is an inlier of the
+    problem. ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers. Points and poses do not depend
+    on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
     this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
@@ -109,12 +109,11 @@ class SceneProblems(RandomProblems):
             :class:`SyntheticProblems`.
         outliers: number of outliers and share of mismatches; no outliers are added when ``None``. Scenes of raw matches
             already contain outliers.
-        num_spares: number of spare points per problem. The first mismatch gets the pixel of the first
-            spare point, and so on. With the
-            protocol's one spare point, all mismatches of a problem share a pixel.
+        num_spares: number of spare points per problem. Mismatches get their pixels in turn. With the protocol's one
+            spare point, all mismatches of a problem share a pixel.
 
     Raises:
-        BaseError: for an argument out of range, or ``outliers`` with *near* or *structured* outliers or crowds.
+        BaseError: for ``outliers`` with *near* or *structured* outliers or crowds.
         ValueError: if no image has enough points.
     """
 
@@ -172,7 +171,7 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
         last = counts - k + i  # grows with i, so `last` was not chosen before
-        candidate = (draws[:, i] * (last + 1)).long().minimum(last)
+        candidate = (draws[:, i] * (last + 1)).long()
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)
     # Floyd's algorithm draws a uniform set, but its order is not uniform. Each row is therefore shuffled.

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import atexit
 import multiprocessing
 import signal
 from collections.abc import Generator
+from functools import partial
+from multiprocessing.util import Finalize
 from typing import Any, Protocol
 
+import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils._pytree import tree_map_only
+from torch.utils.data import DataLoader
 
-from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.result import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
@@ -21,7 +23,7 @@ _AHEAD = 4
 
 
 class ProblemSource(Protocol):
-    """A source of problems. Equal indices give equal batches. For workers, all batches must have the same shape."""
+    """A source of problems. Equal indices give equal batches."""
 
     batch_size: int
 
@@ -42,17 +44,17 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         start: index of the first batch.
         stop: index after the last batch.
         workers: number of worker processes. With 0, each batch is drawn on request. The problems do not depend on the
-            number of workers. With workers, a batch is valid only until the next batch is requested.
+            number of workers.
     """
-    if workers == 0 or start >= stop:
+    if workers == 0:
         yield from map(source.batch, range(start, stop))
         return
-    slots = _SharedSlots(source, source.batch(start), slots=workers * _AHEAD + 1)
     methods = multiprocessing.get_all_start_methods()
+    indices: Any = range(start, stop)
     loader = DataLoader(
-        slots,
-        sampler=range(start, stop),
+        indices,
         batch_size=None,
+        collate_fn=partial(_draw_arrays, source),
         num_workers=workers,
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
@@ -60,35 +62,20 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         # In processes of joblib, the default start method is joblib's own. A loader cannot use this method.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
-    indices: Any = iter(loader)
+    arrays: Any = iter(loader)
     # At exit, multiprocessing sends one SIGTERM to each worker and waits. Workers ignore the first SIGTERM, so this
-    # handler ends the workers first.
-    atexit.register(indices._shutdown_workers)
+    # finalizer ends the workers first.
+    end_workers = Finalize(None, arrays._shutdown_workers, exitpriority=0)
     try:
-        yield from map(slots.read, indices)
+        for batch in arrays:
+            yield tree_map_only(np.ndarray, torch.from_numpy, batch)
     finally:
-        atexit.unregister(indices._shutdown_workers)
-        indices._shutdown_workers()  # else a traceback that refers to `indices` keeps the workers alive
+        end_workers()  # else a traceback that refers to `arrays` keeps the workers alive
 
 
-class _SharedSlots(Dataset[int]):
-    """Shared memory for batches. A worker writes batch ``i`` into a slot and sends only ``i``.
-
-    Sending the tensors would be slower, because every batch would allocate shared memory. One slot holds the caller's
-    batch, and the other slots hold the batches drawn in advance.
-    """
-
-    def __init__(self, source: ProblemSource, example: Problems, slots: int) -> None:
-        self._source, self._slots = source, slots
-        self._memory = example.map(lambda x: torch.empty((slots, *x.shape), dtype=x.dtype).share_memory_())
-
-    def __getitem__(self, index: int) -> int:
-        map_tensors(torch.Tensor.copy_, self.read(index), self._source.batch(index))
-        return index
-
-    def read(self, index: int) -> Problems:
-        """Return batch ``index`` as views of its slot."""
-        return self._memory.map(lambda x: x[index % self._slots])
+def _draw_arrays(source: ProblemSource, index: int) -> Any:
+    """Draw a batch as NumPy arrays. A worker would send each tensor through shared memory of its own, which is slow."""
+    return tree_map_only(torch.Tensor, torch.Tensor.numpy, source.batch(index))
 
 
 def _ignore_signals(_worker: int) -> None:

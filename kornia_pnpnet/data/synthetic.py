@@ -36,8 +36,6 @@ _AMOUNTS = {
 _MOST_RATIO = 100.0
 # Largest pixel noise of an inlier with Student noise, in standard deviations. A choice.
 _MOST_NOISE = 10.0
-# Smallest squared length of noise, in squared standard deviations. The bound avoids 0 / 0 in Student noise.
-_LEAST_SQ_LENGTH = 1e-12
 # Smallest divisor in pixels: replaces a standard deviation of 0.
 _TINY = 1e-9
 # Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87°.
@@ -47,8 +45,6 @@ _LEAST_COSINE = 0.05
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
 # The first pairs of a problem are no copies. A choice: eight originals can still hold a pose.
 _LEAST_ORIGINALS = 8
-# Fields of `Problems` with one value for each pair. Sigmas of whole problems have one dimension, and no copies.
-_OF_PAIRS = ("world_points", "img_points", "inliers", "img_sigma", "world_sigma", "confidence", "img_cov", "world_cov")
 # Largest blur in `_bunched`, relative to the mean distance. A choice: at a blur of 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
 # Choices for confidences. `_SEPARATION`: distance between the mean scores of inliers without noise and of outliers.
@@ -63,9 +59,7 @@ class SyntheticProblems(RandomProblems):
 
     Points are drawn in the camera's frame. The inverse of a random pose transforms the points to the world frame. World
     coordinates and pixels get noise, and some pairs become outliers. The defaults are the protocol's distribution
-    ``paper`` without outliers. ``translation_sigma=25`` gives the distribution ``gaussian_pose``. The distribution
-    ``fixed_mismatches`` is ``outliers=OutlierMix(count=k, mismatch_share=1.0)``. A range is two numbers between which
-    each problem draws a log-uniform number.
+    without outliers. A range is two numbers between which each problem draws a log-uniform number.
 
     Args:
         n: number of pairs per problem.
@@ -87,12 +81,11 @@ class SyntheticProblems(RandomProblems):
             ``10 * img_sigma`` are then outliers.
         sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. Above 0,
             known sigmas have the shape ``(batch_size, n)``.
-        axis_ratio: ratio of the largest to the smallest standard deviation over the axes of a pair's noise, at most
-            100. Each pair has random axes. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the
-            axes, and known noise is given as covariances.
+        axis_ratio: ratio of the largest to the smallest standard deviation over the random axes of a pair's noise, at
+            most 100. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the axes, known noise is
+            given as covariances, and ``known_noise`` must be 0 or 1.
         known_noise: share of the problems that have both sigmas. With 0, batches have no sigmas. Above 0, a third of
-            the other problems have one sigma, and missing sigmas are NaN. With an ``axis_ratio`` above 1, the share
-            must be 0 or 1.
+            the other problems have one sigma, and missing sigmas are NaN.
         confidence_share: share of the problems that have confidences; other problems have NaN. With 0, batches have no
             confidences. The separation of inliers from outliers and the scale of the logits differ between problems.
         bunched_share: share of the problems with a bunch. In these problems, inliers, *near* and *structured* outliers
@@ -103,9 +96,6 @@ class SyntheticProblems(RandomProblems):
             problems, up to half of the pairs are copies of other pairs. The first 8 pairs are no copies.
         dtype: dtype of the batches; numbers are drawn in float64.
         device: device of the batches; numbers are drawn on the CPU.
-
-    Raises:
-        BaseError: for a number or a range out of its bounds.
 
     Example:
         >>> problems = SyntheticProblems(n=9, batch_size=2, seed=1, outliers=OutlierMix(count=3)).batch(0)
@@ -135,10 +125,8 @@ class SyntheticProblems(RandomProblems):
         sizes = {name: getattr(self, name) for name in ("max_angle", "half_image", "translation_sigma")}
         check_numbers(0.0, **{name: value for name, value in sizes.items() if value is not None})
         check_positive(focal=self.focal)
-        shares = {
-            name: getattr(self, name) for name in ("known_noise", "confidence_share", "bunched_share", "copies_share")
-        }
-        check_numbers(0.0, 1.0, **shares)
+        shares = {name: value for name, value in vars(self).items() if name.endswith("_share")}
+        check_numbers(0.0, 1.0, known_noise=self.known_noise, **shares)
         check_numbers(1.0, _MOST_RATIO, axis_ratio=self.axis_ratio)
         for name, (low, high) in _AMOUNTS.items():
             value = getattr(self, name)
@@ -157,8 +145,7 @@ class SyntheticProblems(RandomProblems):
         # The scene has 2N points: N points of the pairs, and N points for the pixels of mismatches.
         scene = (self.points or BoxPoints())(size, 2 * n, generator)
         kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
-        in_crowd = (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
-        has_other = (kind == OutlierKind.MISMATCH) | in_crowd
+        has_other = (kind == OutlierKind.MISMATCH) | (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
         is_sensing = kind == OutlierKind.SENSING
         anywhere = self._anywhere(scene, generator)
         if self.bunched_share:
@@ -213,11 +200,10 @@ class SyntheticProblems(RandomProblems):
         size, n = problems.inliers.shape
         share = torch.where(unit((size, 1), generator) < self.copies_share, unit((size, 1), generator) / 2.0, 0.0)
         is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
-        other = (n * unit((size, n), generator)).long().clamp(max=n - 1)
+        other = (n * unit((size, n), generator)).long()
         index = torch.where(is_copy, other, torch.arange(n))
-        of_pairs = {name: x for name, x in problems._asdict().items() if name in _OF_PAIRS and x is not None}
-        taken = {name: x[torch.arange(size)[:, None], index] for name, x in of_pairs.items() if x.ndim > 1}
-        return problems._replace(**taken)
+        # With three pairs, poses and cameras are indexed too, but the index then keeps the order.
+        return problems.map(lambda x: x[torch.arange(size)[:, None], index] if x.shape[1:2] == (n,) else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
         """Draw uniform pixels of the image, (B, N, 2)."""
@@ -261,7 +247,7 @@ class SyntheticProblems(RandomProblems):
             sigmas = sigmas * (exponents * self._amounts(self.sigma_spread, generator)).exp()
         if degrees:
             freedom = self._amounts(degrees, generator)
-            sq_length = noise.square().sum(-1, keepdim=True).clamp(min=_LEAST_SQ_LENGTH)
+            sq_length = noise.square().sum(-1, keepdim=True)
             noise *= (freedom * (sq_length / freedom).expm1() / sq_length).sqrt()
         noise *= sigmas
         if self.axis_ratio == 1.0:
@@ -290,11 +276,7 @@ class SyntheticProblems(RandomProblems):
         return known
 
     def _confidence(self, inliers: Tensor, errors: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw confidences, (B, N), in (0, 1) or NaN for problems without confidences.
-
-        Inliers with more pixel noise have lower confidences. ``errors`` is the length of the pixel noise in standard
-        deviations, (B, N).
-        """
+        """Draw confidences, (B, N). ``errors``, (B, N), is the length of the pixel noise in standard deviations."""
         each = self.batch_size, 1
         separation, noisiness = (uniform(each, *bounds, generator) for bounds in (_SEPARATION, _NOISINESS))
         score = normal(inliers.shape, generator) + torch.where(inliers, separation - noisiness * errors.log1p(), 0.0)

@@ -1,7 +1,4 @@
-"""Bounds: the accuracy that a solver could reach if it knew the inliers, or the inliers and the noise.
-
-A bound needs the true poses and inliers of the problems, so a bound cannot solve new problems.
-"""
+"""Bounds: the accuracy that a solver could reach if it knew the inliers, or the inliers and the noise."""
 
 from __future__ import annotations
 
@@ -19,8 +16,7 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["KnownInliers", "KnownInliersAndNoise"]
 
-# From the true pose, the cost reaches its minimum to 7 digits in 3 iterations, and to all float64 digits in 10
-# iterations.
+# From the true pose, the cost reaches its minimum to 7 digits in 3 iterations, to all digits of float64 in 10.
 _ITERATIONS = 10
 
 
@@ -33,8 +29,7 @@ def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResu
 class KnownInliers(Configured):
     r"""Least squares of the reprojection errors of the true inliers, starting from the true pose.
 
-    A method that must first find the inliers cannot expect a higher accuracy. Source: the protocol's bound *known
-    inliers*.
+    A method that must first find the inliers cannot expect a higher accuracy.
 
     Example:
         >>> from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -55,18 +50,13 @@ class KnownInliers(Configured):
 class KnownInliersAndNoise(Configured):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
-    Noise in a world point moves the pixel of a close point more than the pixel of a distant point. The weight is
-    :math:`1 / (\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2)`. Here :math:`J_x` is
-    the Jacobian of the pixel with respect to the world point, at the true pose. Source: the protocol's bound *known
-    inliers and noise*.
-
-    For problems with covariances the result is the maximum likelihood estimate from the inliers: the covariances whiten
-    the residuals. If only one covariance is known, ``img_sigma`` or ``world_sigma`` replaces the unknown covariance.
+    The variance is :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2`, where
+    :math:`J_x` is the Jacobian of the pixel with respect to the world point at the true pose. Covariances of the
+    problems replace the sigmas and whiten the residuals; the result is then the maximum likelihood estimate.
 
     Args:
-        img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
-        world_sigma: standard deviation of the noise on each world coordinate, in the unit of the world. Both defaults
-            are the values of the protocol's synthetic data.
+        img_sigma: standard deviation of a pixel coordinate. The default is that of the protocol's synthetic data.
+        world_sigma: standard deviation of a world coordinate; see ``img_sigma``.
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both are 0.
@@ -79,12 +69,11 @@ class KnownInliersAndNoise(Configured):
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """See :meth:`KnownInliers.solve_with_truth`."""
-        covs = {"img": problems.img_cov, "world": problems.world_cov}
-        if all(cov is None for cov in covs.values()):
+        if problems.img_cov is None and problems.world_cov is None:
             return _least_squares(problems, self._inverse_variances(problems))
-        sigmas = {f"{kind}_sigma": self.config[f"{kind}_sigma"] for kind, cov in covs.items() if cov is None}
-        known = {f"{kind}_cov": cov for kind, cov in covs.items() if cov is not None}
-        return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **sigmas, **known)
+        noise = {"img_cov": problems.img_cov, "world_cov": problems.world_cov}
+        noise |= {name: sigma for name, sigma in self.config.items() if noise[name.replace("sigma", "cov")] is None}
+        return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **noise)
 
     @torch.no_grad()  # else the gradient of a NaN point would be NaN for all points
     def _inverse_variances(self, problems: Problems) -> Tensor:

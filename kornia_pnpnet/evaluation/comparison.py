@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import statistics
 import time
@@ -12,14 +13,14 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from kornia.core.exceptions import ShapeError
-from torch import Tensor, nn
+from torch import nn
 
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import digest
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors, take
 from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, row_errors, save_results, source_digest
-from kornia_pnpnet.metrics import PoseErrors, pose_errors, success, success_rate
+from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.result import PnPResult, Problems, gate_pose
 from kornia_pnpnet.solver import PnPNet
 
@@ -31,21 +32,13 @@ _MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
 
 
 class EvaluationData(NamedTuple):
-    """A set of problems and the limits of a success.
+    """A set of problems in one batch, and the limits of a success."""
 
-    Attributes:
-        problems: all problems of the set in one batch.
-        max_rotation_deg: limit of the rotation error of a success, in degrees.
-        max_translation: limit of the translation error of a success, in the unit of the world.
-        unit: name of the unit of the world, for tables and axis labels.
-        description: source of the problems as plain data for the results file.
-    """
-
-    problems: Problems
-    max_rotation_deg: float = 1.0
-    max_translation: float = 0.2
-    unit: str = "m"
-    description: Mapping[str, Any] = {}
+    problems: Problems  #: The problems.
+    max_rotation_deg: float = 1.0  #: Limit of the rotation error in degrees.
+    max_translation: float = 0.2  #: Limit of the translation error in the unit of the world.
+    unit: str = "m"  #: Name of the unit of the world.
+    description: Mapping[str, Any] = {}  #: Source of the problems as plain data for the results file.
 
 
 @runtime_checkable
@@ -58,14 +51,7 @@ class SeesTruth(Protocol):
 
 
 def draw_problems(source: ProblemSource, count: int) -> Problems:
-    """Take the first problems of a source.
-
-    Args:
-        source: a source of problems, for example :class:`~kornia_pnpnet.data.SyntheticProblems`.
-        count: number of problems; ``ValueError`` for a number below 1.
-
-    Returns:
-        The first ``count`` problems of the concatenated batches 0, 1, ...
+    """Take the first ``count`` problems of the batches 0, 1, ... of a source; ``ValueError`` for a count below 1.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -87,43 +73,32 @@ def evaluate(
     overwrite: bool = False,
     chunk: int = 1000,
     repeats: int = 3,
-    progress: bool | None = None,
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A pose that is not finite is replaced by the identity, with ``ok`` false. Errors are rounded to six significant
-    digits, and summaries are computed from the rounded errors.
-
-    With a ``path``, the results file is written after every row. A call with the same arguments, or with further
-    solvers and data sets, continues the file. A file with rows of other code, versions, weights, configurations or
-    problems is refused.
+    A pose that is not finite is replaced by the identity, with ``ok`` false. Summaries are computed from errors that
+    are rounded to six significant digits. The results file is written after every row. A call with the same arguments,
+    or with further solvers and data sets, continues the file. Any other evaluation is refused.
 
     Args:
-        solvers: solvers by name. Each solver is called as ``solver(world_points, img_points, intrinsics)`` in
-            evaluation mode without gradients. A :class:`~kornia_pnpnet.solver.PnPNet` also gets
-            :attr:`~kornia_pnpnet.result.Problems.known`. For bounds see :class:`SeesTruth`.
+        solvers: solvers by name, called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode without
+            gradients. A :class:`~kornia_pnpnet.solver.PnPNet` also gets :attr:`~kornia_pnpnet.result.Problems.known`.
+            For bounds see :class:`SeesTruth`.
         data: sets of problems by name. Each set is solved on its own device and in its own dtype.
         path: the results file; ``None`` writes no file.
         overwrite: replace the file at ``path`` instead of continuing it.
         chunk: number of problems per call of a solver. A smaller number takes less memory.
-        repeats: smallest number of timed calls. An untimed call on the first chunk precedes the timed calls.
-        progress: show a progress bar; ``None`` shows it if standard error is a terminal.
+        repeats: smallest number of timed calls, which follow an untimed call.
 
     Returns:
-        Plain data with the keys
+        Plain data: ``format``, ``code`` (digest of the package), ``environment`` (see
+        :func:`~kornia_pnpnet.core.environment.environment`), ``solvers`` (class, configuration, digest of the weights),
+        ``data`` (description, limits, digest), ``rows``, and ``left_out`` (``data``, ``solver`` and ``reason`` for each
+        set whose shape a solver refuses).
 
-        - ``format`` (version of the format), ``code`` (digest of the package) and ``environment`` (see
-          :func:`~kornia_pnpnet.core.environment.environment`),
-        - ``solvers``: class, configuration and digest of the weights of each solver,
-        - ``data``: description, limits and digest of each set,
-        - ``rows``: one row for each set and solver,
-        - ``left_out``: ``data``, ``solver`` and ``reason`` for each set whose shape a solver refuses (a network for
-          another n).
-
-        A row has ``success`` (rate, low, high, total), ``rotation_error_deg`` and ``translation_error`` (quartiles),
-        ``ok`` (share), ``us_per_problem`` (median of the timed calls), and ``per_problem`` (errors and ok of each
-        problem). A row from another machine also has ``environment``, with the entries that differ from the file's
-        ``environment``.
+        The row of a set and a solver has ``success`` (rate, low, high, total), ``rotation_error_deg`` and
+        ``translation_error`` (quartiles), ``ok`` (share), ``us_per_problem`` (median of the timed calls),
+        ``per_problem`` (errors and ok), and ``environment`` where its machine differs from that of the file.
 
     Raises:
         ValueError: when ``path`` is not a results file, or holds another evaluation.
@@ -158,7 +133,7 @@ def evaluate(
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
     missing = [names for names in plan if names not in done]
-    for names in tqdm(missing, disable=None if progress is None else not progress, unit="run"):
+    for names in tqdm(missing, disable=None, unit="run"):  # None: no bar without a terminal
         row: dict[str, Any] = dict(zip(("data", "solver"), names, strict=True))
         try:
             row |= _measure(solvers[row["solver"]], data[row["data"]], chunk, repeats)
@@ -204,32 +179,17 @@ def _describe_data(entry: EvaluationData) -> dict[str, Any]:
     }
 
 
+@torch.no_grad()
 def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
     """Solve a set and return its row without the names of the set and the solver."""
-    was_training = solver.training
+    problems, was_training = entry.problems, solver.training
+    chunks = [take(problems, slice(i, i + chunk)) for i in range(0, len(problems.world_points), chunk)]
     solver.eval()
     try:
-        with torch.no_grad():
-            errors, ok, seconds = _solve_all(solver, entry.problems, chunk, repeats)
+        _solve(solver, chunks[0])
+        calls = [_solve(solver, chunks[i % len(chunks)]) for i in range(max(repeats, len(chunks)))]
     finally:
         solver.train(was_training)
-    lists = {name: values.tolist() for name, values in errors._asdict().items()}
-    per_problem = _rounded({**lists, "ok": ok.int().tolist()})
-    errors, ok = row_errors({"per_problem": per_problem})
-    row: dict[str, Any] = {
-        "success": success_rate(success(errors, entry.max_rotation_deg, entry.max_translation))._asdict()
-    }
-    for name, values in errors._asdict().items():
-        row[name] = {key: values.quantile(share).item() for key, share in _QUARTILES.items()}
-    row |= {"ok": ok.double().mean().item(), "us_per_problem": 1e6 * seconds}
-    return {**_rounded(row), "per_problem": per_problem}
-
-
-def _solve_all(solver: nn.Module, problems: Problems, chunk: int, repeats: int) -> tuple[PoseErrors, Tensor, float]:
-    """Return errors (float64) and ok of all problems, on the CPU, and the median seconds per problem."""
-    chunks = [take(problems, slice(i, i + chunk)) for i in range(0, len(problems.world_points), chunk)]
-    _solve(solver, chunks[0])
-    calls = [_solve(solver, chunks[i % len(chunks)]) for i in range(max(repeats, len(chunks)))]
     # A smaller last chunk is not timed, because the fixed cost of a call would raise the time per problem.
     full = len(chunks[0].world_points)
     seconds = statistics.median(elapsed / full for result, elapsed in calls if len(result.ok) == full)
@@ -237,29 +197,37 @@ def _solve_all(solver: nn.Module, problems: Problems, chunk: int, repeats: int) 
     pose, ok = map_tensors(lambda *parts: torch.cat(parts), *found)
     pose, truth = map_tensors(lambda part: part.double().cpu(), (pose, problems.pose))
     finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
-    return pose_errors(gate_pose(pose, finite, finite), truth), ok.cpu() & finite, seconds
+    errors, ok = pose_errors(gate_pose(pose, finite, finite), truth), ok.cpu() & finite
+
+    lists = {name: values.tolist() for name, values in errors._asdict().items()}
+    per_problem = _rounded({**lists, "ok": ok.int().tolist()})
+    errors, ok = row_errors({"per_problem": per_problem})
+    rate = success_rate(success(errors, entry.max_rotation_deg, entry.max_translation))
+    row: dict[str, Any] = {"success": rate._asdict()}
+    for name, values in errors._asdict().items():
+        row[name] = {key: values.quantile(share).item() for key, share in _QUARTILES.items()}
+    row |= {"ok": ok.double().mean().item(), "us_per_problem": 1e6 * seconds}
+    return {**_rounded(row), "per_problem": per_problem}
 
 
 def _solve(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
     """Return the result and the time in seconds."""
-    on_gpu = problems.world_points.is_cuda
-    if on_gpu:
-        torch.cuda.synchronize()
-    start = time.perf_counter()
+    device = problems.world_points.device
+    start = _now(device)
     if isinstance(solver, SeesTruth):
         result = solver.solve_with_truth(problems)
     else:
-        known = problems.known if isinstance(solver, PnPNet) else {}
-        result = solver(problems.world_points, problems.img_points, problems.intrinsics, **known)
-    if on_gpu:
-        torch.cuda.synchronize()
-    return result, time.perf_counter() - start
+        result = solver(*problems[:3], **(problems.known if isinstance(solver, PnPNet) else {}))
+    return result, _now(device) - start
+
+
+def _now(device: torch.device) -> float:
+    """The time in seconds when the device has done its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
 
 
 def _rounded(value: Any) -> Any:
     """Round the floats of nested data to six significant digits, so that results files stay small."""
-    if isinstance(value, dict):
-        return {key: _rounded(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_rounded(entry) for entry in value]
-    return float(f"{value:.6g}") if isinstance(value, float) else value
+    return json.loads(json.dumps(value), parse_float=lambda digits: float(f"{float(digits):.6g}"))

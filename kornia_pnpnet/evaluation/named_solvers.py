@@ -28,13 +28,13 @@ _COMPETITORS = (
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Options of RANSAC for real scenes. The threshold is the best of a grid from 3 to 60 px. The grid used problems of
-# another seed from five scenes, with 0, 2 and 4 outliers in 9 pairs. Success hardly changes from 6 to 20 px.
+# Options of RANSAC for real scenes: the best threshold of a grid from 3 to 60 px on problems of another seed from five
+# scenes, with 0, 2 and 4 outliers in 9 pairs. Success hardly changes from 6 to 20 px.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
-# Options of RANSAC for synthetic data. The thresholds are the best of a grid from (3 px, 0.15 m) to (8 px, 0.4 m), on
-# problems of another seed. Success varies by one percentage point over the grid.
+# Options of RANSAC for synthetic data: the best thresholds of a grid from (3 px, 0.15 m) to (8 px, 0.4 m) on problems
+# of another seed. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
 # Optional packages by the start of solver names: module and name of the package.
 _PACKAGES = {
@@ -46,14 +46,11 @@ _PACKAGES = {
 
 
 def load_solver(spec: str) -> nn.Module:
-    """Build a solver or a bound from its name.
+    """Build a solver or a bound, in evaluation mode, from its name.
 
     Args:
         spec: a name of :func:`~kornia_pnpnet.registry.list_solvers` or of :data:`BOUNDS`, with options after a colon
             (``"opencv-ransac:threshold=12,refine=false"``), or a folder of weights.
-
-    Returns:
-        The solver in evaluation mode. A bound is a :class:`~kornia_pnpnet.evaluation.SeesTruth`.
 
     Raises:
         BaseError: for an unknown name or option.
@@ -77,16 +74,12 @@ def load_solver(spec: str) -> nn.Module:
 
 
 def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic",)) -> list[str]:
-    """List the installed competitors and the bounds of the protocol for problems of ``n`` pairs.
+    """Names for :func:`load_solver`: the installed competitors and the bounds of the protocol.
 
     Args:
         n: number of pairs per problem, or several such numbers.
-        sources: sources of the problems, see :func:`~kornia_pnpnet.evaluation.problem_sets.evaluation_sets`. If any
-            source is synthetic, RANSAC gets thresholds for synthetic data. Otherwise RANSAC gets thresholds for scenes,
-            and the bound that needs the noise is left out.
-
-    Returns:
-        Names with options for :func:`load_solver`.
+        sources: see :func:`~kornia_pnpnet.evaluation.problem_sets.evaluation_sets`. If none is synthetic, RANSAC gets
+            thresholds for scenes, and the bound that needs the noise is left out.
     """
     sizes = [n] if isinstance(n, int) else list(n)
     names = dict.fromkeys(competitor.format(n=size) for competitor in _COMPETITORS for size in sizes)
@@ -98,6 +91,6 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
 
 
 def missing_package(solver: str) -> str | None:
-    """Return the name of the missing package that a solver needs, or ``None`` if no package is missing."""
+    """The name of the package that a solver needs and that is not installed, or ``None``."""
     needed = (package for prefix, package in _PACKAGES.items() if solver.startswith(prefix))
     return next((name for module, name in needed if importlib.util.find_spec(module) is None), None)

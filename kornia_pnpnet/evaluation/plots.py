@@ -1,7 +1,6 @@
-"""Pictures of a pose, an evaluation and a training.
+"""Pictures of a pose, an evaluation and a training, in the format of the file's suffix.
 
-Each ``plot_`` function writes a picture to ``path`` in the format of the file's suffix, and returns the path. The
-settings of matplotlib change only while a picture is drawn.
+The settings of matplotlib change only while a picture is drawn.
 """
 
 from __future__ import annotations

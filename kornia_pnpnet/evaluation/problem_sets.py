@@ -76,15 +76,14 @@ def evaluation_sets(
         count: number of problems per set.
         seed: seed of the problems.
         metric: whether the scenes are in metres.
-        mismatches_only: make every outlier a mismatch; no two mismatches of a problem share a pixel. When false, about
-            half of the outliers are mismatches, and the other outliers have random pixels.
+        mismatches_only: make every outlier a mismatch, each with another pixel. Else about half of the outliers are
+            mismatches, and the others have random pixels.
         known_noise: add the standard deviations of the noise to synthetic problems. Points and pixels do not change.
         dtype: dtype of the problems, which are drawn in float64 and then converted.
 
     Returns:
-        Sets by name, one for each combination of source, n and outliers. The description of a set has the keys
-        ``source`` (name of the prior or the scene), ``outliers`` (``"none"``, ``"uniform"`` or an integer),
-        ``mismatch_share``, ``seed`` and, for a scene, ``path``.
+        Sets by name, one for each combination of source, n and outliers. A description has ``source`` (name of the
+        prior or the scene), ``outliers``, ``mismatch_share``, ``seed`` and, for a scene, ``path``.
 
     Raises:
         BaseError: when a source or a mix cannot be used.
@@ -109,21 +108,17 @@ def evaluation_sets(
             for size, label, mix, number in mixes:
                 options: dict[str, Any] = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype}
                 description = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
+                limits: dict[str, Any] = {}
                 if scene is None:
                     prior, make = PRIORS[source]
                     problems = draw_problems(make(**options, **noise, batch_size=_DRAW_BATCH), count)
-                    entry = EvaluationData(problems, description={"source": prior, **description})
-                else:
-                    # A mismatch gets the pixel of a spare point. With one spare point, all mismatches would share a
-                    # pixel.
+                    origin = {"source": prior}
+                else:  # a mismatch gets the pixel of a spare point, and no two mismatches the same pixel
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
                     views = SceneProblems(scene, num_spares=spares, **options, batch_size=_DRAW_BATCH)
-                    description = {"source": scene.name, "path": source, **description}
-                    unit = "m" if scene.metric else ""
-                    problems = draw_problems(views, count)
-                    entry = EvaluationData(
-                        problems, max_translation=views.max_translation, unit=unit, description=description
-                    )
+                    problems, origin = draw_problems(views, count), {"source": scene.name, "path": source}
+                    limits = {"max_translation": views.max_translation, "unit": "m" if scene.metric else ""}
+                entry = EvaluationData(problems, **limits, description=origin | description)
                 sets[f"{name}, n = {size}, {added}{label}{suffix}"] = entry
         except ValueError as error:
             raise ValueCheckError(f"{source}: {error}") from error

@@ -33,8 +33,7 @@ _SHOWN_DIFFERENCES = 3
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
     """Read the errors (float64) and ``ok`` (bool) of all problems of a row, each :math:`(B,)`.
 
-    Raises:
-        ValueError: when the row has no per-problem errors. The repository's results files have only summaries.
+    ``ValueError`` for a row without per-problem errors. The repository's results files have only summaries.
     """
     if "per_problem" not in row:
         raise ValueError(f"The row of '{row['solver']}' on '{row['data']}' has no per-problem errors.")
@@ -44,12 +43,7 @@ def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
 
 
 def save_results(results: Mapping[str, Any], path: str | Path) -> None:
-    """Write results to a JSON file atomically: readers never find an incomplete file.
-
-    Raises:
-        ValueError: when a number is not finite, because JSON has no such numbers.
-        OSError: when the file cannot be written.
-    """
+    """Write results to a JSON file atomically; ``ValueError`` for a number that is not finite."""
     with atomic_open(path, encoding="utf-8") as file:
         file.write(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
 
@@ -90,9 +84,7 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
     """Fill ``plan``, which has no rows, with the rows of the file at ``path``. A missing file is ignored.
 
-    Raises:
-        ValueError: when the plan does not continue the file. Code, versions, and the solvers and data sets of the file
-            must be equal in the plan. The message names the first differences.
+    ``ValueError`` names the first differences if code, versions, solvers or data sets of the file differ in the plan.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh
@@ -113,10 +105,7 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
 
 
 def format_table(results: Mapping[str, Any]) -> str:
-    """Format results as a Markdown table with aligned columns.
-
-    A line has the set, the solver, the success with its 95 % interval, median errors, time and share of ``ok``.
-    """
+    """Format results as a Markdown table: success with its 95 % interval, median errors, time and share of ``ok``."""
     lines = []
     for row in results["rows"]:
         # The flag # keeps trailing zeros, as in 0.160.

@@ -1,8 +1,4 @@
-"""Decide whether a pose is to be believed, from the evidence for it and from the accuracy that the inliers allow.
-
-Each problem has one pose, given by its :class:`~kornia_pnpnet.refine.residual.Projection`. The results have no
-gradient.
-"""
+"""Decide whether a pose is to be believed, from the evidence for it and from the accuracy that the inliers allow."""
 
 from __future__ import annotations
 
@@ -71,14 +67,8 @@ def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> B
     """Tell whether a pose is to be believed.
 
     The :func:`probability` must be at least `LEAST_PROBABILITY`, and :func:`pose_sigma` must be small. The points of
-    the inliers must span more than a line. The noise must be plausible: pairs of a wrong convention, such as mirrored
-    pixels, show much noise at their best pose.
-
-    Args:
-        seen: the residuals at the pose.
-        problem: the problem.
-        found: the evidence for the pose.
-        known: whether the caller gave the noise of a problem, bool (B, 1).
+    the inliers must span more than a line. The noise must be plausible, or ``known`` (B, 1) from the caller: pairs of a
+    wrong convention, such as mirrored pixels, show much noise at their best pose.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
@@ -90,17 +80,10 @@ def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> B
 
 
 def probability(log_ratio: Tensor, sigma: Tensor) -> Tensor:
-    """Probability that a pose is correct.
+    """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The rotation of a correct pose has an error of at most 10 degrees. The error of its translation is at most 30 % of
-    the distance of the points. The probability is a logistic function of the evidence and of the logarithm of sigma.
-
-    Args:
-        log_ratio: ``log_ratio`` of :class:`~kornia_pnpnet.judge.evidence.Evidence`, shape :math:`(B,)`.
-        sigma: :func:`pose_sigma`, shape :math:`(B,)`.
-
-    Returns:
-        In (0, 1), shape :math:`(B,)`.
+    The probability is a logistic function of the evidence ``log_ratio`` and of the logarithm of :func:`pose_sigma`,
+    both (B,).
     """
     evidence, log_sigma = clipped(log_ratio, sigma)
     offset, by_evidence, by_sigma = LAW
@@ -116,15 +99,8 @@ def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Sym
     """Standard deviation of the pose, in units of the largest errors of a correct pose.
 
     The variances of the rotation and of the translation are traces of their covariances. An unknown focal length, whose
-    error changes the distance, is part of the covariance.
-
-    Args:
-        projection: the points projected at the pose.
-        problem: the problem.
-        precision: inverse variance of each pixel in px^-2, (B, N), or inverse covariance, 0 for outliers.
-
-    Returns:
-        float64 of shape :math:`(B,)`, infinite if the inliers do not determine the pose.
+    error changes the distance, is part of the covariance. ``precision`` is the inverse variance (or covariance) of each
+    pixel in px^-2, (B, N), 0 for outliers. The result is float64, (B,), infinite for an undetermined pose.
     """
     precision = map_tensors(lambda x: problem.focal.square() * x, precision)
     matrix = normal_equations(projection, problem, precision).matrix
@@ -139,7 +115,8 @@ def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Sym
             left = own - _form(matrix[:, :6, :6], cross[:, 0])
             variance = torch.where(left > 0, left.reciprocal(), torch.inf) / _FAR_SHIFT**2
         matrix = matrix[:, :k, :k] - cross.mT * cross / own[:, None, None].clamp(min=torch.finfo(own.dtype).tiny)
-    turn, cross, shift = matrix[:, :3, :3], matrix[:, 3:6, :3], matrix[:, 3:6, 3:6]
+    above, below = matrix.split(3, 1)
+    turn, (cross, shift) = above[..., :3], below.split(3, -1)
     points = projection.rotated + projection.state.pose.translation.mT[:, None]
     distance = points.square().sum(0).sqrt().mT.double()
     share = (precision if isinstance(precision, Tensor) else precision.uu).double()
@@ -170,23 +147,22 @@ def _form(matrix: Tensor, vector: Tensor) -> Tensor:
 def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
     """Whether enough points (B, N, 3) of the inliers (B, N) lie off a line, bool (B,).
 
-    A line does not determine a pose. Outliers can fit a pose by chance, because a line leaves one rotation free. With
-    eight or more inliers, three points must therefore lie off the line.
+    A line leaves one rotation free, so that a few outliers can determine a pose by chance.
     """
-    weights = there = inliers.to(world_points.dtype)
+    weights = there = inliers.to(world_points.dtype)[..., None]  # (B, N, 1)
     tiny = torch.finfo(weights.dtype).tiny
     for _ in range(_LINE_ROUNDS):
-        share = (weights / weights.sum(-1, keepdim=True).clamp(min=tiny))[:, None]
-        centred = world_points - torch.bmm(share, world_points)
-        matrix = torch.bmm(centred.mT, share.mT * centred)
+        share = weights / weights.sum(1, keepdim=True).clamp(min=tiny)
+        centred = world_points - torch.bmm(share.mT, world_points)
+        matrix = torch.bmm(centred.mT, share * centred)
         matrix = matrix / matrix.norm(dim=(1, 2), keepdim=True).clamp(min=tiny)
         for _ in range(_SQUARINGS):  # the direction of the line is the first eigenvector
             matrix = torch.bmm(matrix, matrix)
         direction = matrix.sum(-1, keepdim=True)
         direction = direction / direction.norm(dim=1, keepdim=True).clamp(min=tiny)
         along = torch.bmm(centred, direction)
-        sq_off = (centred - torch.bmm(along, direction.mT)).square().sum(-1)
-        limit = _OFF**2 * torch.bmm(share, along.square())[:, 0]
-        weights = there / (1.0 + sq_off / limit.clamp(min=tiny))
-    off = (inliers & (sq_off > limit)).sum(-1)
+        sq_off = torch.baddbmm(centred, along, direction.mT, alpha=-1).square().sum(-1, keepdim=True)
+        limit = _OFF**2 * torch.bmm(share.mT, along.square())
+        weights = there / (sq_off + limit.clamp(min=tiny**0.5))
+    off = (inliers & (sq_off > limit)[..., 0]).sum(-1)
     return off >= (inliers.sum(-1) - _FEW).clamp(1, MIN_PAIRS)

@@ -32,7 +32,7 @@ from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, State
 from kornia_pnpnet.refine.information import information
 from kornia_pnpnet.refine.residual import Projection, project
 
-__all__ = ["AtPose", "Evidence", "Mixture", "at_pose", "copies", "evidence", "outlier_area", "updated", "votes"]
+__all__ = ["AtPose", "Evidence", "Mixture", "Votes", "at_pose", "copies", "evidence", "updated"]
 
 # Unknown noise: the smallest standard deviation of the grid in radians, the ratio of neighbouring variances, and the
 # number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
@@ -52,24 +52,56 @@ _LEAST_SHARE = 3e-3
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Number of poses of a minimal sample.
 _POSES = 4
-# Rows are sorted by a key with these coefficients, so that equal rows are adjacent. The ratios of the coefficients are
-# irrational, so that different points of a grid have different keys.
-_KEY = 1.0, 0.7548776662, 0.5698402910, 0.3247179572, 0.2451223338
+# Rows are sorted by a key, the sum of their columns times powers of this number, so that equal rows are adjacent. The
+# number is transcendental, so that different rows of integers have different keys. The powers are computed on the
+# device, because a CUDA graph cannot contain a copy from the CPU.
+_KEY = math.pi / 4
+
+
+class Votes(NamedTuple):
+    """What the evidence takes from a problem, whatever its pose.
+
+    Attributes:
+        pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
+        known: whether the caller gave the noise of a problem, bool (B, 1).
+        outlier: density of an outlier's pixel, divided by the density of a narrow inlier at the projection, if the
+            variance of the inlier is 1 px² and half of the pairs are inliers, (B, 1).
+    """
+
+    pairs: Tensor
+    known: Tensor
+    outlier: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, problem: Problem, known: Tensor) -> Votes:
+        """Count the copies of pairs, and spread the outliers over a square with the variance of the usual pixels."""
+        there = problem.weights > 0
+        cells = torch.cat((problem.img_points / (_PIXEL_CELL * problem.focal), problem.world_points / _POINT_CELL), -1)
+        pairs = torch.where(there, copies(cells.round(), there).reciprocal(), 0.0)
+        usual = (problem.usual_weights > 0).to(problem.weights)[..., None]
+        share = usual / usual.sum(1, keepdim=True).clamp(min=1.0)
+        places = problem.places
+        variance = (share * (places - (share * places).sum(1, keepdim=True)).square()).sum((1, 2))[:, None]
+        area = 6.0 * variance + (LEAST_NOISE * problem.focal).square()
+        return cls(pairs, known, 2.0 * math.pi / (1.0 - _TAIL) / area)
 
 
 class AtPose(NamedTuple):
-    """The residuals of a problem at a pose, for :func:`evidence`.
+    """The residuals of a problem at a pose.
 
     Attributes:
         projection: the points projected at the pose.
-        sq_residual: squared residuals in variances of their pixel, infinite behind the camera, (B, N).
-        density: the square root of the determinant of the precision, (B, N).
-        precision: inverse variance of each pixel, (B, N), or inverse covariance.
+        exponent: minus half of the squared residual in variances of its pixel, -∞ in effect behind the camera, (B, N).
+        density: the square root of the determinant of the precision, (B, N) or (1, 1).
+        outlier: ``Votes.outlier`` with the variance of each pixel, (B, N) or (B, 1).
+        precision: inverse variance of each pixel, (B, N) or (1, 1), or inverse covariance.
     """
 
     projection: Projection
-    sq_residual: Tensor
+    exponent: Tensor
     density: Tensor
+    outlier: Tensor
     precision: Tensor | Symmetric2
 
     @property
@@ -85,26 +117,29 @@ class Mixture(NamedTuple):
         variance: factor of the variances of the inliers, shape (B, 1). If the problem has no noise, the unit is px².
         share: share of inliers, shape (B, 1).
         least: lower bound of ``variance``, shape (B, 1). Few pairs could otherwise be fitted ever more closely.
-        area: area of the square in which the pixels of outliers are uniformly distributed, px², shape (B, 1).
+        total: sum of the votes, shape (B, 1).
     """
 
     variance: Tensor
     share: Tensor
     least: Tensor
-    area: Tensor
+    total: Tensor
 
-    def densities(self, sq_residual: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Relative densities of narrow inliers, wide inliers and outliers, (B, N); see :func:`at_pose`."""
-        scaled = sq_residual / self.variance
-        narrow = (1.0 - _TAIL) * (-0.5 * scaled).exp()
-        wide = _TAIL / _WIDE * (-0.5 / _WIDE * scaled).exp()
-        odds = 2.0 * math.pi * (self.share.reciprocal() - 1.0) * self.variance
-        return narrow, wide, odds / (self.area * density)
+    def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Relative densities (B, N) of inliers, of inliers each divided by its factor of the variance, and of outliers.
+
+        ``exponent`` and ``outlier`` are those of :class:`AtPose`.
+        """
+        scaled = exponent / self.variance
+        narrow, wide = scaled.exp(), (scaled / _WIDE).exp()
+        share = _TAIL / (1.0 - _TAIL) / _WIDE
+        inlier, weighted = (torch.add(narrow, wide, alpha=x) for x in (share, share / _WIDE))
+        return inlier, weighted, (self.variance / self.share - self.variance) * outlier
 
     def weights(self, seen: AtPose) -> Tensor:
         """Robust weights (B, N): the derivatives of the negative log-likelihood, at most 1."""
-        narrow, wide, outlier = self.densities(seen.sq_residual, seen.density)
-        return torch.add(narrow, wide, alpha=1.0 / _WIDE) / (narrow + wide + outlier)
+        inlier, weighted, outlier = self.densities(seen.exponent, seen.outlier)
+        return weighted / (inlier + outlier)
 
 
 class Evidence(NamedTuple):
@@ -135,7 +170,8 @@ class Evidence(NamedTuple):
 @torch.no_grad()
 def copies(rows: Tensor, there: Tensor) -> Tensor:
     """Number (B, N) of rows that equal each row of (B, N, C), among the rows ``there`` (B, N); at least 1."""
-    order = (rows * rows.new_tensor(_KEY[: rows.shape[-1]])).sum(-1).argsort(1)
+    key = _KEY ** torch.arange(rows.shape[-1], dtype=rows.dtype, device=rows.device)
+    order = (rows * key).sum(-1).argsort(1)
     ordered = rows.gather(1, order[..., None].expand_as(rows))
     # `long`, because PyTorch 2.13 cannot compile the maximum of booleans.
     new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
@@ -145,100 +181,64 @@ def copies(rows: Tensor, there: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def votes(problem: Problem) -> Tensor:
-    """The vote of each pair, (B, N): the inverse of the number of copies, 0 for padding."""
-    there = problem.weights > 0
-    cells = torch.cat((problem.img_points / (_PIXEL_CELL * problem.focal), problem.world_points / _POINT_CELL), -1)
-    return torch.where(there, copies(cells.round(), there).reciprocal(), 0.0)
-
-
-@torch.no_grad()
-def outlier_area(problem: Problem) -> Tensor:
-    """Area of the square that has the variance of the pixels of usual pairs (see ``Problem.usual``), px², (B, 1)."""
-    there = (problem.usual_weights > 0).to(problem.weights)[..., None]
-    share = there / there.sum(1, keepdim=True).clamp(min=1.0)
-    places = problem.places
-    variance = (share * (places - (share * places).sum(1, keepdim=True)).square()).sum((1, 2))[:, None]
-    return 6.0 * variance + (LEAST_NOISE * problem.focal).square()
-
-
-@torch.no_grad()
-def evidence(seen: AtPose, problem: Problem, votes: Tensor, known: Tensor) -> Evidence:
-    """Compute the evidence for a pose.
-
-    Args:
-        seen: the residuals at the pose.
-        problem: the problem. Its noise is known for every pair or ``None``.
-        votes: the result of :func:`votes`.
-        known: whether the caller gave the noise of a problem, bool (B, 1).
-    """
-    sq_residual, density, focal = (x.detach() for x in (seen.sq_residual, seen.density, problem.focal))
-    area, total = outlier_area(problem).detach(), votes.sum(-1, keepdim=True).clamp(min=1.0)
-    there = votes > 0
+def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
+    """Compute the evidence for a pose of a problem, whose noise is known for every pair or ``None``."""
+    exponent, density, outliers = (x.detach() for x in (seen.exponent, seen.density, seen.outlier))
+    there, total = votes.pairs > 0, votes.pairs.sum(-1, keepdim=True).clamp(min=1.0)
     mean = torch.where(there, density.log(), 0.0).sum(-1, keepdim=True) / there.sum(-1, keepdim=True).clamp(min=1)
-    radian = focal.square() * mean.exp()
-    factors, log_prior = _grid(radian, known)  # (F, B, 1) each
-    half = torch.full_like(factors, 0.5)
-    narrow, wide, outlier = Mixture(factors, half, factors, area).densities(sq_residual, density)
-    inlier_density = narrow + wide
-    odds, inverse, share = inlier_density / outlier, outlier / inlier_density, half
+    radian = problem.focal.square() * mean.exp()
+    factors, log_prior = _grid(radian, votes.known)  # (F, B, 1) each
+    share = factors.new_full((), 0.5)
+    inlier, _, outlier = Mixture(factors, share, factors, total).densities(exponent, outliers)  # (F, B, N)
+    chances, more = votes.pairs / total * inlier, inlier - outlier
     for _ in range(_ROUNDS):
-        inlier = (1.0 + (1.0 / share - 1.0) * inverse).reciprocal()
-        share = ((votes * inlier).sum(-1, keepdim=True) / total).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
-    terms = (share * odds + 1.0 - share).log()
+        share = share * (chances / torch.addcmul(outlier, share, more)).sum(-1, keepdim=True)
+        share = share.clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
+    terms = (torch.addcmul(outlier, share, more) / outlier).log()
     fitted = (terms * there).topk(MIN_PAIRS, -1).values.clamp(min=0.0).sum(-1, keepdim=True)
-    likelihood = (votes * terms).sum(-1, keepdim=True) - fitted + log_prior  # (F, B, 1)
-    count = total[:, 0].clamp(min=MIN_PAIRS)
-    samples = count * (count - 1.0) * (count - 2.0) / 6.0
-    log_ratio = likelihood.logsumexp(0)[:, 0] - math.log(_POSES) - samples.log()
-    best = likelihood.argmax(0)[None]
+    likelihood = (votes.pairs * terms).sum(-1, keepdim=True) - fitted + log_prior  # (F, B, 1)
+    last = total[:, 0].clamp(min=MIN_PAIRS) - 1.0
+    samples = last**3 - last  # six times the number of triples
+    log_ratio = likelihood.logsumexp(0)[:, 0] - (_POSES / 6.0 * samples).log()
+    best = likelihood.argmax(0, keepdim=True)
     variance, share = (x.gather(0, best)[0] for x in (factors, share))
     # The smallest angle of the grid stands for all smaller angles.
-    exact = torch.finfo(share.dtype).eps ** 2
-    least = torch.where(best[0] > 0, share.new_full((), _STEP**-0.5), exact) * variance
-    mixture = Mixture(variance, share, least, area)
+    least = torch.where(best[0] > 0, _STEP**-0.5 * variance, torch.finfo(share.dtype).eps ** 2 * variance)
+    mixture = Mixture(variance, share, least, total)
     for _ in range(_FINAL_ROUNDS):
-        mixture = updated(mixture, seen, votes, known)
-    narrow, wide, outlier = mixture.densities(sq_residual, density)
-    inlier = (narrow + wide) / (narrow + wide + outlier) * there
-    sq_finite = sq_residual.nan_to_num(posinf=0.0)
-    freedom = (2.0 * (votes * inlier).sum(-1) - seen.unknowns).clamp(min=1.0)
-    sigma = ((votes * inlier * sq_finite).sum(-1) / freedom / radian[:, 0]).sqrt()
+        mixture = updated(mixture, seen, votes)
+    inlier, _, outlier = mixture.densities(exponent, outliers)
+    inlier = inlier / (inlier + outlier) * there
+    chances = votes.pairs * inlier
+    freedom = (0.5 * seen.unknowns - chances.sum(-1)).clamp(max=-0.5)
+    sigma = ((chances * exponent).sum(-1) / freedom / radian[:, 0]).sqrt()
     return Evidence(log_ratio, likelihood[..., 0].mT, mixture, inlier, radian, sigma)
 
 
-def at_pose(state: State, problem: Problem) -> AtPose:
+def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
     """Project the points at a pose, and standardise the residuals. Without noise, the variance of a pixel is 1 px²."""
     projection = project(state, problem)
     sq_residual, precision = information(projection, problem)
-    sq_residual = torch.where(projection.in_front, sq_residual, torch.inf)
-    if problem.noise is None:
-        precision = torch.ones_like(sq_residual)
+    exponent = torch.where(projection.in_front, -0.5 * sq_residual, -(torch.finfo(sq_residual.dtype).max ** 0.5))
     density = precision if isinstance(precision, Tensor) else precision.determinant.sqrt()
-    return AtPose(projection, sq_residual, density, precision)
+    return AtPose(projection, exponent, density, votes.outlier / density, precision)
 
 
 @torch.no_grad()
-def updated(mixture: Mixture, seen: AtPose, votes: Tensor, known: Tensor) -> Mixture:
+def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None = None) -> Mixture:
     """One round of expectation and maximisation.
 
-    Args:
-        mixture: the mixture before the round.
-        seen: the residuals.
-        votes: votes of the pairs, (B, N).
-        known: where true, the variance does not change, bool (B, 1).
+    The variance of problems ``frozen``, bool (B, 1), does not change; ``None``: of those with noise from the caller.
     """
-    sq_residual, density = seen.sq_residual.detach(), seen.density.detach()
-    narrow, wide, outlier = mixture.densities(sq_residual, density)
-    inlier, total = narrow + wide, votes.sum(-1, keepdim=True).clamp(min=1.0)
-    chances = votes / (inlier + outlier)
+    exponent = seen.exponent.detach()
+    inlier, weighted, outlier = mixture.densities(exponent, seen.outlier.detach())
+    chances = votes.pairs / (inlier + outlier)
     inliers = (chances * inlier).sum(-1, keepdim=True)
-    finite = sq_residual.nan_to_num(posinf=0.0)
-    weighted = (chances * torch.add(narrow, wide, alpha=1.0 / _WIDE) * finite).sum(-1, keepdim=True)
-    variance = (weighted / (2.0 * inliers - seen.unknowns).clamp(min=1.0)).maximum(mixture.least)
+    squares = (chances * weighted * exponent).sum(-1, keepdim=True)  # times -1/2
+    variance = (squares / (0.5 * seen.unknowns - inliers).clamp(max=-0.5)).maximum(mixture.least)
     return mixture._replace(
-        variance=torch.where(known, mixture.variance, variance),
-        share=(inliers / total).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE),
+        variance=torch.where(votes.known if frozen is None else frozen, mixture.variance, variance),
+        share=(inliers / mixture.total).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE),
     )
 
 

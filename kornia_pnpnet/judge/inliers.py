@@ -1,9 +1,8 @@
 r"""Find the inliers of a pose by thresholds.
 
 A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
-:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. At the depth :math:`z`, this
-shift moves the projection by :math:`f \omega / z` pixels. The left-hand side divided by the right-hand side is the
-*standardised* squared residual.
+:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point, which moves the projection by
+:math:`f \omega / z` pixels. The ratio of both sides is the *standardised* squared residual.
 """
 
 from __future__ import annotations
@@ -25,12 +24,7 @@ MAX_ERROR = 1e6
 
 
 class Thresholds(NamedTuple):
-    r"""The inlier thresholds of each problem or pair.
-
-    Attributes:
-        img: :math:`\tau` in pixels of the problem, shape :math:`(B, 1)` or :math:`(B, N)`.
-        world: :math:`\omega` in units of the problem's world, shape :math:`(B, 1)` or :math:`(B, N)`.
-    """
+    r"""The thresholds :math:`\tau` and :math:`\omega` of each problem or pair, :math:`(B, 1)` or :math:`(B, N)`."""
 
     img: Tensor
     world: Tensor
@@ -45,9 +39,8 @@ class Judged(NamedTuple):
 
     Attributes:
         weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for all other pairs, shape :math:`(B, N)`.
-            If :math:`\omega` is 0, the weight of an inlier is 1.
-        errors: standardised squared residuals, shape :math:`(B, N)`. Inliers have values below 1. Points behind the
-            camera have the value :data:`MAX_ERROR`.
+        errors: standardised squared residuals, below 1 for inliers, :data:`MAX_ERROR` behind the camera, shape
+            :math:`(B, N)`.
     """
 
     weights: Tensor

@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import eigenvectors
-from kornia_pnpnet.core.performance import repeat_problems
+from kornia_pnpnet.core.performance import problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.judge.belief import FAR_TURN
 from kornia_pnpnet.judge.evidence import Evidence
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.scoring import as_entries, as_pose
-from kornia_pnpnet.refine.lm import Plan, Progress, Refinement, RobustWeightedLM, taken
+from kornia_pnpnet.refine.lm import Plan, Progress, RobustWeightedLM, taken
 from kornia_pnpnet.refine.residual import project, rotation_angle
 from kornia_pnpnet.result import Alternatives, Pose
 
@@ -26,9 +26,9 @@ __all__ = ["find_alternatives", "reconsider"]
 _LIKELY = 1e-3
 # Upper bound of the logarithm of this likelihood ratio, so that the exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum if their rotations differ by less than `_SAME_TURN` radians and their positions by less
-# than `_SAME_SHIFT`. A position is the mean point in the camera frame, in units of its distance from the camera.
-_SAME_TURN, _SAME_SHIFT = 0.035, 0.035
+# Two poses are the same minimum if their rotations differ by less than this number of radians, and the mean point in
+# the camera frame by less than this share of its distance from the camera.
+_SAME = 0.035
 # A mirror image is refined if most residuals of the inliers are below this number times the spread of the pixels.
 _NEAR_MIRROR = 0.2
 # With a larger share of inliers, a pose has no rivals of other noise.
@@ -38,33 +38,21 @@ _WIDE_ANGLE, _WIDE_FROM, _GAP = 6.4e-3, 4, 0.4
 # The caller's rivals: factor by which the first variance is smaller, least angle from the pose, and largest share of
 # inliers of a pose that has such a rival.
 _SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.005, 0.97
-# Number of iterations of a rival at this noise, and number of further iterations.
-_FROZEN, _FREE = 3, 5
-# Number of iterations by residual from each start, at the noise of the pose.
-_ITERATIONS = 12
+# Number of iterations of a rival at this noise, number of further iterations, and number of iterations from each start
+# of `find_alternatives`.
+_FROZEN, _FREE, _ITERATIONS = 3, 5, 12
 
 
 @torch.no_grad()
 def find_alternatives(
     refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, valid: Tensor, most: int
 ) -> Alternatives:
-    """Find other minima that are nearly as likely as the pose. All minima differ from the pose and from each other.
+    """Find at most ``most`` other minima that are nearly as likely as the pose, all in the frame of the problem.
 
-    One start of the refinement is the mirror image of the pose, see `_mirrored`. Four starts are the P3P solutions of
-    three pairs that lie far apart. The other starts are the poses of ``starts``. When the camera sees a plane almost
-    from the front, the mirror image can be nearly as likely as the pose without being a minimum. If the refinement of
-    the mirror image ends at the pose, the unrefined mirror image is therefore used.
-
-    Args:
-        refine: the refinement that found the pose.
-        problem: the problem.
-        starts: the starts from which the refinement found the pose.
-        pose: the pose that the refinement found, in the frame of the problem.
-        valid: which problems are valid (see :class:`~kornia_pnpnet.frame.Frame`), bool (B,).
-        most: largest number of other poses.
-
-    Returns:
-        The other poses in the frame of the problem.
+    The refinement starts from the mirror image of the pose, from the P3P solutions of three pairs that lie far apart,
+    and from the poses of ``starts``. When the camera sees a plane almost from the front, the mirror image can be nearly
+    as likely as the pose without being a minimum. If the refinement of the mirror image ends at the pose, the unrefined
+    mirror image is therefore used. Problems that are not ``valid`` (B,) have no other poses.
     """
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
     plan = refine.begin(problem, starts._replace(pose=pose, others=None, camera=None))
@@ -77,18 +65,20 @@ def find_alternatives(
     tried = Progress.of(State.of(as_pose(torch.cat(every))), mixture)
     step, damping, _ = plan.hyperparameters[-1]
     for _ in range(_ITERATIONS):
-        tried = refine.by_residuals(many, tried, torch.ones_like(many.known), step, damping)
-    unrefined = refine.judge(plan, Progress.of(State.of(mirrored), now.mixture))
-    ends, cost, likelihood, usable = (x.unflatten(0, (count, batch)) for x in _ends(refine.judge(many, tried)))
-    lost = _are_same(ends[1], every[0], middle)
-    for x, image in zip((ends, cost, likelihood, usable), _ends(unrefined), strict=True):
-        x[1, lost] = image[lost]
+        tried = refine.by_residuals(many, tried, torch.ones_like(many.votes.known), step, damping)
+    ends = torch.cat((as_entries(tried.state.pose), every[1]))
+    plans, mixture = repeat_problems((plan, now.mixture), count + 1)
+    refined = refine.judge(plans, Progress.of(State.of(as_pose(ends)), mixture))
+    usable = refined.in_front & refined.cost.isfinite()
+    each = ends, refined.cost, refined.evidence.likelihood, usable
+    ends, cost, likelihood, usable = (x.unflatten(0, (count + 1, batch)) for x in each)
+    usable[count] &= _are_same(ends[1], every[0], middle)
     log_ratio = (likelihood - likelihood[0]).clamp(max=_LIKELIER)
     log_ratio = torch.where(usable & (log_ratio > math.log(_LIKELY)), log_ratio, -torch.inf)
     log_ratio, order = log_ratio.sort(dim=0, descending=True, stable=True)
     ends, cost = ends.take_along_dim(order[..., None], 0), cost.take_along_dim(order, 0)
     valid = valid & log_ratio.isfinite() & ~_are_same(ends, every[0], middle)
-    for i in range(1, count):
+    for i in range(1, count + 1):
         same = _are_same(ends, ends[i], middle)
         valid[i] &= ~(same[:i] & valid[:i]).any(0)
     share = torch.where(valid, log_ratio, -torch.inf).exp()
@@ -114,13 +104,6 @@ def reconsider(
     starts with a smaller noise, if it differs from the pose. A rival that ends more than 10 degrees from the result
     lowers the probability of the result.
 
-    Args:
-        refine: the refinement.
-        plan: the plan of the refinement.
-        now: the refined states.
-        valid: which problems are valid (see :class:`~kornia_pnpnet.frame.Frame`), bool (B,).
-        rival: another pose of each problem; ``None``: no such pose.
-
     Returns:
         For :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for them, and their
         log-odds against the rivals.
@@ -135,32 +118,30 @@ def reconsider(
         projection = project(State(mirrored, now.state.camera), problem)
         close = projection.in_front & (projection.sq_residual < _NEAR_MIRROR**2 * sq_spread)
         mirrors = valid & (found.log_ratio > 0.0) & ((inlier * close).sum(-1) > 0.5)
-        free, share = valid & ~plan.known[:, 0] & by_residual, found.mixture.share[:, 0]
+        free, share = valid & ~plan.votes.known[:, 0] & by_residual, found.mixture.share[:, 0]
         gap = found.likelihood - found.grid[:, _WIDE_FROM:].amax(1)
-        unclear = free & (share < _CLEAR) & (gap < _GAP * plan.votes.sum(-1))
+        unclear = free & (share < _CLEAR) & (gap < _GAP * plan.votes.pairs.sum(-1))
         rival = pose if rival is None else rival
         apart = rotation_angle(rival.rotation, pose.rotation) > _APART
         apart &= valid & (share < _CLEAR_OF_RIVALS) & by_residual
         own = found.mixture
         wide = own._replace(variance=own.variance.maximum(_WIDE_ANGLE**2 * found.radian))
-        narrower = torch.where(plan.known, own.variance.new_ones(()), 1.0 / _SMALLER)
+        narrower = torch.where(plan.votes.known, own.variance.new_ones(()), 1.0 / _SMALLER)
         narrow = own._replace(variance=narrower * own.variance, least=narrower.square() * own.least)
-        chosen = [x.nonzero()[:, 0] for x in (unclear, unclear, mirrors, apart)]
-    owners = torch.cat(chosen)
+        kinds = (pose, own), (pose, wide), (mirrored, own), (rival, narrow)
+        kind, owners = torch.stack((unclear, unclear, mirrors, apart)).nonzero().unbind(1)
     if not len(owners):
         return now, found, None
-    kind = torch.cat([torch.full_like(rows, i + 1) for i, rows in enumerate(chosen)])
-    poses, mixtures = (pose, pose, mirrored, rival), (own, wide, own, narrow)
-    starts = [taken((x, y), rows) for x, y, rows in zip(poses, mixtures, chosen, strict=True)]
-    pose, mixture = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *starts)
+    pose, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
     every = taken(plan._replace(state=now.state, starts=1), owners)
     tried = Progress.of(every.state._replace(pose=pose), mixture)
     step, damping, _ = plan.hyperparameters[-1]
     for i in range(_FROZEN + _FREE):
-        tried = refine.by_residuals(every, tried, every.known | (i < _FROZEN), step, damping)
+        tried = refine.by_residuals(every, tried, every.votes.known | (i < _FROZEN), step, damping)
     of_ends = every.evidence_at(tried.state)
     # By kind of the rival (0: the refined pose) and by problem, (5, B).
-    likelihood = found.likelihood.new_full((len(chosen) + 1, len(valid)), -torch.inf)
+    kind = kind + 1
+    likelihood = found.likelihood.new_full((len(kinds) + 1, len(valid)), -torch.inf)
     end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()
     likelihood[0] = found.likelihood
     likelihood[kind, owners] = of_ends.likelihood.nan_to_num(-torch.inf)
@@ -173,12 +154,6 @@ def reconsider(
     far = rotation_angle(tried.state.pose.rotation, now.state.pose.rotation[owners]) > FAR_TURN
     others[kind, owners] = torch.where(far, likelihood[kind, owners], -torch.inf)
     return now, found, likelihood.amax(0) - others.amax(0)
-
-
-def _ends(refined: Refinement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Entries, costs and log-likelihoods of poses. A pose is usable if its cost is finite and it sees enough points."""
-    usable = refined.in_front & refined.cost.isfinite()
-    return as_entries(refined.pose), refined.cost, refined.evidence.likelihood, usable
 
 
 def _shares(weights: Tensor) -> Tensor:
@@ -237,5 +212,5 @@ def _are_same(poses: Tensor, other: Tensor, middle: Tensor) -> Tensor:
     """Whether poses (*, B, 12) are the same minimum as ``other`` (B, 12). ``middle`` (B, 3) is the mean point."""
     pose, other_pose = as_pose(poses), as_pose(other.expand_as(poses))
     there = _moved(middle, other_pose)
-    shift = (_moved(middle, pose) - there).norm(dim=-1) < _SAME_SHIFT * there.norm(dim=-1)
-    return shift & (rotation_angle(pose.rotation, other_pose.rotation) < _SAME_TURN)
+    shift = (_moved(middle, pose) - there).norm(dim=-1) < _SAME * there.norm(dim=-1)
+    return shift & (rotation_angle(pose.rotation, other_pose.rotation) < _SAME)

@@ -1,18 +1,16 @@
 r"""EPnP: a pose from four or more pairs. A closed-form solution is refined by Gauss-Newton steps in four unknowns.
 
-A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`. The coordinates :math:`a_{ij}` of the
-point are the same in the world frame and in the camera frame. Lepetit et al. use four control points :math:`c_j` and
-barycentric coordinates. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3` are *vectors* from the centroid.
-These coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`. The pose does not depend on the axes of the
-world.
+A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`, with the same coordinates
+:math:`a_{ij}` in the world frame and in the camera frame. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3`
+are *vectors* from the centroid, so that the coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`. (Lepetit
+et al. use four points and barycentric coordinates.)
 
 The projection equations are :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0` and :math:`\sum_j a_{ij} (y_j - v_i z_j) = 0`.
 For given depths :math:`z` of the control points, the least-squares solutions are :math:`x = P z` and :math:`y = Q z`,
-with :math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. The remaining unknowns are the
-four depths, with the algebraic error :math:`z^\top K z`. (The paper has 12 unknowns.) The columns of :math:`D(z)` are
-the control vectors in the camera frame, and the columns of :math:`L` are the control vectors in the world frame. If
-:math:`D^\top D = L^\top L`, a rotation or a reflection maps :math:`L` to :math:`D`. An array (4, C, B) contains the
-four depths of C candidates.
+with :math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. The four depths remain of the
+paper's 12 unknowns, with the algebraic error :math:`z^\top K z`. The columns of :math:`D(z)` and :math:`L` are the
+control vectors in the camera frame and in the world frame. If :math:`D^\top D = L^\top L`, a rotation or a reflection
+maps :math:`L` to :math:`D`. An array (4, C, B) contains the four depths of C candidates.
 """
 
 from __future__ import annotations
@@ -32,16 +30,14 @@ __all__ = ["ControlPoints", "EPnP", "control_points"]
 
 # Points are planar when their smallest extent is below this fraction of their middle extent.
 _PLANAR_RATIO = 1e-3
-# A problem needs at least this number of pairs to be `ok`.
-_MIN_PAIRS = 4
-# A problem needs at least this number of pairs in front of the camera to be `ok`.
-_MIN_IN_FRONT = 3
-# Each of the four cases takes this number of Gauss-Newton steps. The best case is chosen afterwards.
+# A problem needs this number of pairs, and this number of pairs in front of the camera, to be `ok`.
+_MIN_PAIRS, _MIN_IN_FRONT = 4, 3
+# Number of Gauss-Newton steps of each of the four cases, before the best case is chosen.
 _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Size of a ridge, as a share of the squared spread of the pixels. The ridge orders null vectors of equal algebraic
-# error: null vectors along the longest extents of the world come first. The ridge affects only the start values.
+# Size of a ridge, as a share of the squared spread of the pixels. Of null vectors with equal algebraic errors, those
+# along the longest extents of the world come first.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
@@ -60,12 +56,8 @@ class ControlPoints(NamedTuple):
 def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    Each of three steps selects the coordinate with the largest variance, and makes the other coordinates orthogonal to
-    the selected coordinate. The paper uses principal directions. Principal directions need an eigendecomposition, and
-    have no gradient if two extents are equal.
-
-    Args:
-        problem: the problem. Pairs with the weight 0 are ignored.
+    Each of three steps selects the coordinate with the largest variance, and makes the others orthogonal to it. (The
+    paper's principal directions have no gradient if two extents are equal.) Pairs with the weight 0 are ignored.
 
     Example:
         >>> world = torch.tensor([[[4.0, 0, 0], [-4, 0, 0], [0, 2, 0], [0, -2, 0]]])
@@ -103,14 +95,13 @@ class EPnP(Initialiser):
 
     The control points in the camera frame are a combination of the null vectors of the projection equations. The
     coefficients have to preserve the distances between the control points. Gauss-Newton starts from four cases, with
-    one to four null vectors. The best case has the least weighted reprojection error. Orthogonal Procrustes aligns the
-    world with the best case.
+    one to four null vectors. Orthogonal Procrustes aligns the world with the case of the least weighted reprojection
+    error.
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Four things differ from the paper. Two thirds of the unknowns are eliminated (see the module). Only the first null
-    vector moves the centroid in depth. The objective does not depend on the choice of the control points. The objective
-    includes the algebraic error, because the null vectors of noisy pairs have different algebraic errors. Planar points
-    use the same equations, with 0 as the last control vector.
+    Four things differ. Two thirds of the unknowns are eliminated (see the module). Only the first null vector moves the
+    centroid in depth. The objective does not depend on the choice of the control points, and includes the algebraic
+    error, which noisy null vectors do not share. Planar points use the same equations, with 0 as the last vector.
 
     Four or five pairs can have up to four solutions. The solution with the least reprojection error may then be
     incorrect. A problem is not ``ok`` with fewer than four pairs, with points on a line, or with fewer than three pairs
@@ -216,18 +207,9 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
     unit = torch.where(control.ok, mean_square, 1.0).sqrt()
     vectors = control.points[:, 1:].permute(2, 1, 0) / unit
     gram = small_product(vectors.transpose(0, 1), vectors)[:, :, None]
-    last = (x.permute(1, 2, 0).contiguous() for x in (coordinates, plane_points))
-    return _DepthSystem(
-        next(last),
-        control.weights.mT,
-        next(last),
-        unit,
-        vectors,
-        gram,
-        maps[..., None, :],
-        error,
-        weight * error[:, :, None],
-    )
+    coordinates, plane_points = (x.permute(1, 2, 0).contiguous() for x in (coordinates, plane_points))
+    known = coordinates, control.weights.mT, plane_points, unit, vectors, gram
+    return _DepthSystem(*known, maps[..., None, :], error, weight * error[:, :, None])
 
 
 def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
@@ -236,10 +218,9 @@ def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
 
 
 def _null_space(system: _DepthSystem) -> Tensor:
-    """A basis v of the depths, z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄, (4, 4 vectors, B). In this basis K is nearly diagonal.
+    """A basis v of the depths, z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄, (4, 4 vectors, B), in which K is nearly diagonal.
 
-    The vector v₁ has the least algebraic error of all depths with the centroid at depth 1. The vectors v₂, v₃ and v₄
-    have the centroid at depth 0, in ascending order of their algebraic errors.
+    The centroid has the depth 1 in v₁, else 0. The algebraic errors of v₂, v₃ and v₄ ascend.
     """
     error, eye = system.error, torch.eye(4, dtype=system.error.dtype, device=system.error.device)[..., None]
     spread = error[0, 0] + system.maps[:2, 0, 1:, 0].square().sum((0, 1))
@@ -253,9 +234,8 @@ def _null_space(system: _DepthSystem) -> Tensor:
 def _four_cases(system: _DepthSystem) -> Tensor:
     r"""The depths (4, 4 cases, B) of the paper's four cases, with 1, 2, 3 and 4 null vectors.
 
-    Linear least squares find products of the coefficients :math:`\beta`. The third case omits the smallest product
-    :math:`\beta_3^2`. The fourth case adds only :math:`\beta_1 \beta_4`, so that six equations have six unknowns. The
-    linear systems of all cases are leading blocks of one system.
+    Linear least squares find products of the coefficients :math:`\beta`. Without the smallest product
+    :math:`\beta_3^2`, six equations have six unknowns. All linear systems are leading blocks of one system.
     """
     basis = _null_space(system)
     vectors = _in_camera(system, basis)[:, 1:]  # (3 axes, 3 vectors, 4 null vectors, B)
@@ -288,10 +268,7 @@ def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Ten
 
 
 def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
-    r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z`.
-
-    The six different entries of the Gram matrix :math:`D^\top D` replace the paper's six distances.
-    """
+    r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` (the paper has six distances)."""
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(system, depths)
         (step,) = solve_leading([row.unbind(0) for row in normal.unbind(0)], gradient.unbind(0), (4,))
@@ -302,8 +279,7 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
     r"""Attach gradients to minima (4, 1, B) by the implicit function theorem; 0 if a minimum is not isolated.
 
-    The values of ``depths`` do not change. The gradient is the gradient of two Newton steps with a constant matrix.
-    The first step makes first derivatives exact, and the second step makes second derivatives exact.
+    Two Newton steps with a constant matrix, which do not change the values, make first and second derivatives exact.
     """
     with torch.no_grad():
         normal, _, misfit = _normal_equations(system, depths)
@@ -329,10 +305,9 @@ def _frames(one: Tensor, two: Tensor) -> Tensor:
 
 
 def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
-    """Index (B,) of the best case. The best case has the least weighted sum of squared reprojection errors.
+    """Index (B,) of the case with the least weighted sum of squared reprojection errors.
 
-    The rotation from the world to the camera is approximated by the frames of the first two control vectors. This
-    approximation is faster than Procrustes.
+    The frames of the first two control vectors give an approximate rotation, faster than Procrustes.
     """
     camera, world = _in_camera(system, cases), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
     camera_frames, world_frame = _frames(camera[:, 1], camera[:, 2]), _frames(world[:, 0], world[:, 1])

@@ -1,7 +1,4 @@
-"""Propose the poses from which refinement starts.
-
-Networks and EPnP accept only one pinhole camera. For a rig, RANSAC therefore replaces these initialisers.
-"""
+"""Propose the poses from which refinement starts. For a rig, RANSAC replaces initialisers that need one camera."""
 
 from __future__ import annotations
 
@@ -16,6 +13,7 @@ from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
+from kornia_pnpnet.propose.sampling import spread_evenly
 from kornia_pnpnet.propose.search import Search
 from kornia_pnpnet.propose.views import from_views
 from kornia_pnpnet.refine.residual import project
@@ -29,11 +27,8 @@ _SEEN = 0.25
 # Inlier threshold for rigs, in focal lengths: 10 px at a focal length of 1000 px.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
-# With a fixed effort, RANSAC solves `_SAMPLES` samples. Each sample is the first of `_DRAWS` draws of three different
-# pairs.
-_SAMPLES, _DRAWS = 128, 4
-# With a fixed effort, this number of pairs scores each pose.
-_JUDGES = 32
+# With a fixed effort, RANSAC solves this number of samples, and this number of pairs scores each pose.
+_SAMPLES, _JUDGES = 128, 32
 # The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, "The
 # unreasonable effectiveness of quasirandom sequences", 2018).
 _ROOT = 1.2207440846057596
@@ -86,15 +81,8 @@ def propose(
 
 
 @torch.no_grad()
-def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool = False) -> Starts:
-    """Find the pose of a rig, the inliers, and the noise of the pixels, without gradients.
-
-    Args:
-        problem: normalised problems of a rig.
-        given: see :meth:`~kornia_pnpnet.propose.ransac.RANSAC.forward`.
-        with_noise: whether the result has noise. Unknown noise is estimated from the residuals.
-        fixed: see :func:`propose`.
-    """
+def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool) -> Starts:
+    """The pose of a rig, its inliers, and the noise that their residuals show, for the arguments of `propose`."""
     problem = problem.map(torch.Tensor.detach)
     if fixed or not sees_values(problem.weights):
         starts = _of_fixed_effort(problem._replace(weights=relative(problem.weights, problem.weights), noise=None))
@@ -113,25 +101,23 @@ def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fi
 def _of_fixed_effort(problem: Problem) -> Starts:
     """Find the best pose of a fixed number of minimal samples. Only the inliers have positive weights."""
     there = problem.weights > 0
-    counts, order = there.sum(1, keepdim=True), present_first(there)
-    # Judges are the pairs that score all poses. They are spread evenly over the pairs of positive weight.
-    turn = torch.arange(_JUDGES, device=order.device)
-    judges = order.gather(1, turn.maximum(turn * counts // _JUDGES).clamp(max=order.shape[1] - 1))
+    counts = there.sum(1, keepdim=True)
+    judges = torch.where(torch.arange(_JUDGES, device=counts.device) < counts, spread_evenly(there, _JUDGES), -1)
     img = (_THRESHOLD * problem.focal).expand(there.shape[0], 1)
     thresholds = Thresholds(img, torch.zeros_like(img))
     search = Search(_FINDER, problem, thresholds)
-    search.run_once(_drawn(order, counts), torch.where(turn < counts, judges, -1))
+    search.run_once(_drawn(present_first(there), counts), judges)
     pose = search.state.pose
     return Starts(pose, judge(project(State.of(pose), problems_last(problem)), problem, thresholds).weights)
 
 
 def _drawn(order: Tensor, counts: Tensor) -> Tensor:
-    """Draw samples (B, S, 3) from the first ``counts`` (B, 1) positions in ``order`` (B, N)."""
-    numbers = torch.arange(1, _DRAWS * _SAMPLES + 1, dtype=torch.float64, device=order.device)
-    numbers = torch.stack([numbers * _ROOT**-k for k in (1, 2, 3)], -1)  # (D S, 3)
-    ranks = ((numbers - numbers.floor()).flatten() * counts).long()
-    drawn = order.gather(1, ranks.minimum((counts - 1).clamp(min=0)))  # (B, D S 3)
-    drawn = drawn.unflatten(1, (_DRAWS, _SAMPLES, 3))
-    apart = (drawn != drawn.roll(1, -1)).all(-1)
-    first = apart.long().argmax(1)[:, None, :, None].expand(-1, 1, -1, 3)
-    return drawn.gather(1, first)[:, 0]
+    """Draw samples (B, S, 3) of different pairs from the first ``counts`` (B, 1) positions in ``order`` (B, N)."""
+    numbers = torch.arange(1, _SAMPLES + 1, dtype=torch.float64, device=order.device)
+    # The second and the third number are ranks among the pairs that are left.
+    first, second, third = ((numbers * _ROOT**-k % 1.0 * (counts - k + 1)).long() for k in (1, 2, 3))  # (B, S) each
+    second = second + (second >= first)
+    third = third + (third >= torch.minimum(first, second))
+    third = third + (third >= torch.maximum(first, second))
+    ranks = torch.stack((first, second, third), -1).clamp(min=0, max=order.shape[1] - 1)
+    return order.gather(1, ranks.flatten(1)).view_as(ranks)

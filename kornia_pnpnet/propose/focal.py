@@ -32,27 +32,23 @@ _HALF_WIDTH = math.sqrt(2.0)
 # If the caller expects a focal length, the search covers this number of standard deviations of log f on either side.
 _SEARCHED = 2.0
 # Inlier threshold in pixels of the normalised camera. For a focal length in the middle of the range, the threshold is
-# 0.65 % of half the width of the image. RANSAC first uses a larger threshold, because P3P tries only a grid of focal
-# lengths.
+# 0.65 % of half the width of the image.
 _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 
 # Lower bound of the kernel's scale in the first step of `_with_distortion`, in focal lengths. At a radius of 0.7 focal
 # lengths, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07. Each step multiplies the bound by the second number.
 _WIDE, _SHRINK = 0.07, 0.6
-# Number of Gauss-Newton steps in the first estimate of distortion.
-_STEPS = 14
-# The lower bound of the kernel's scale does not shrink below this number of focal lengths.
-_LEAST = 1e-5
+# Number of these steps, and the least bound.
+_STEPS, _LEAST = 14, 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
     """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
 
-    ``sigma`` is the standard deviation of log f. With ``sigma``, the range lies around the caller's focal length.
-    Without ``sigma``, the range is proportional to the size of the image. The size is twice the principal point or, if
-    larger, the extent of the pixels. The aspect ratio of the pixels and the signs of fx and fy are kept. Matrices that
-    are no pinhole cameras become NaN.
+    The range lies around the caller's focal length, if its log has the standard deviation ``sigma``. Otherwise it is
+    proportional to the size of the image: twice the principal point or, if larger, the extent of the pixels. Aspect
+    ratio and signs of fx and fy are kept. Matrices that are no pinhole cameras become NaN.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = focal_length(camera)  # (B,)
@@ -156,8 +152,7 @@ def as_dist(coefficients: Tensor) -> Tensor:
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
     """Estimate pose, focal length and radial distortion by Gauss-Newton steps with a Cauchy kernel.
 
-    The scale of the kernel is proportional to the median residual, but has a lower bound. At first the bound is
-    `_WIDE`, the shift by distortion at the edge of an image. The bound shrinks from step to step.
+    The scale of the kernel is proportional to the median residual. Its lower bound shrinks from step to step.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
     # These steps use only the prior of distortion. The refinement also uses the prior of the focal length.

@@ -1,24 +1,20 @@
 r"""P3P: all poses (up to four) that project three world points exactly onto three pixels, for batches.
 
-The unknowns are the distances :math:`\lambda_k` from the camera to the points. Edge :math:`k` of the triangle is
-opposite to point :math:`k` and connects the points :math:`i` and :math:`j`. The law of cosines for edge :math:`k` is
+The unknowns are the distances :math:`\lambda_k` from the camera to the points. Edge :math:`k` of the triangle connects
+the points :math:`i` and :math:`j`. Let :math:`a_k` be the squared length of the edge, and :math:`b_k` the squared
+length of the difference of the unit rays :math:`i` and :math:`j`. The law of cosines is
 
-.. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k,
+.. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k.
 
-where :math:`a_k` is the squared length of the edge, and :math:`b_k` is the squared length of the difference of the unit
-rays :math:`i` and :math:`j`. If weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three
-equations is a conic in the ratios of the distances. The conic is a pair of lines when
+If weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three equations is a conic in the ratios of
+the distances. With the squared sines :math:`s_k` of the angles between the rays and the squared determinant :math:`g`
+of the rays, the conic is a pair of lines when
 
-.. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3,
+.. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3.
 
-where :math:`s_k` is the squared sine of the angle between the rays :math:`i` and :math:`j`, and :math:`g` is the
-squared determinant of the three rays. One root of this cubic gives two lines. Other weights give a second conic. Each
-line intersects the second conic in two points. A Newton step then refines the ratios.
-
-Sources: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018, for the use of one degenerate conic; Y. Ding, J. Yang,
-V. Larsson, C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023, for the use of the cubic, and for the
-lines from the adjugate matrix. We add the short form of the cubic, the choice of its root, and the equations of the
-lines in differences of distances.
+One root of this cubic gives two lines. Each line intersects a conic with other weights in two points. A Newton step
+then refines the ratios. We add to the sources of :func:`p3p` the short form of the cubic, the choice of its root, and
+the equations of the lines in differences of distances.
 
 The last dimension of every tensor is a chunk of C problems. Finite values are selected by ``lerp`` with a weight of 0
 or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
@@ -29,10 +25,9 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_devices, check_shapes, common_dtype
+from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, common_dtype
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.performance import compiling, exporting, fold_vmap, unfold_vmap
 from kornia_pnpnet.core.trees import map_tensors
@@ -50,19 +45,18 @@ _CHUNK_BYTES = 2**16
 _ERROR_POWER = 2 / 3
 # Largest difference between the edges of a solution's triangle and of the world triangle, relative to the longest edge.
 _LARGEST_ERROR = 0.01
-# A triangle counts as a line when its height over its size is below this number of machine epsilons. The size includes
-# the distance from the origin.
+# A triangle counts as a line when its height, over its size and its distance from the origin, is below this number of
+# machine epsilons.
 _LINE = 32.0
-# If the focal length is unknown, the grid has this number of focal lengths.
+# Number of focal lengths in the grid of an unknown focal length.
 _FOCALS = 12
 # Approximate least distance of the camera from a point. The unit is the longest edge times the machine epsilon to the
 # power `_ERROR_POWER`. A closer camera is rejected, because rounding would determine the ray of the point.
 _CLOSE = 64.0
-# Number of Newton steps for the root of the cubic. The start has a relative error of at most 37 %. Four steps
-# reduce the error to rounding in float64.
+# Newton steps for the root of the cubic. They reduce a relative error of 37 % to rounding in float64.
 _CUBIC_STEPS = 4
-# Power of the machine epsilon. When two solutions nearly coincide, the full Newton step for the ratios would be noise.
-# The step is damped if its squared determinant is below this power times the product of two squared edges.
+# Power of the machine epsilon. A Newton step for the ratios is damped if its squared determinant is below this power
+# times the product of two squared edges: when two solutions nearly coincide, the full step would be noise.
 _DAMPING_POWER = 1.25
 
 
@@ -97,8 +91,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """The real root ``u : v`` of a cubic form (4, C) that is farthest from the other two roots.
 
-    When two solutions of a P3P problem are close to each other, two roots of the cubic are also close to each other.
-    Both solutions then lie on one line, which belongs to the third root.
+    When two solutions of a P3P problem nearly coincide, two roots do, too. The third root has the line of both.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -218,17 +211,10 @@ def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
 
 
 def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
-    """Solve the law of cosines for a triangle whose edge 1 is the longest edge and has the length 1.
+    """Four candidates (3, 2, 2, C) for the distances of a triangle whose edge 1 is the longest and has the length 1.
 
-    Args:
-        p: squared length of edge 3, (C,).
-        q: squared length of edge 2, (C,).
-        r: ``1 - p - q``, (C,), without the rounding of these subtractions.
-        b: squared lengths of the differences of the rays, see the module, (3, C).
-        g: squared determinant of the rays, (C,).
-
-    Returns:
-        Four candidates for the three distances, (3, 2, 2, C). All distances are finite. The first is not negative.
+    ``p`` and ``q`` (C,) are the squared lengths of the edges 3 and 2, and ``r`` is ``1 - p - q`` without rounding. For
+    ``b`` (3, C) and ``g`` (C,) see the module. All candidates are finite, and the first distance is not negative.
     """
     dist = _refined(_candidates(p, q, r, b, g), p, q, b)
     dist1, dist2, dist3 = dist
@@ -248,10 +234,9 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 
 
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Axes and sizes of a triangle from its base and another side.
+    """Unit vectors along the base and the height of a triangle, 1 / base, the side along the base, and the height².
 
-    Returns the unit vectors along the base and along the height, the inverse length of the base, the component of the
-    other side along the base, and the squared height.
+    The triangle is given by its base and another side, both (3, *, C).
     """
     tiny = torch.finfo(base.dtype).tiny
     inv_base = _dot(base, base).clamp_(min=tiny).rsqrt_()
@@ -363,8 +348,8 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 
     The poses have no gradient. The batch is the last dimension in memory.
 
-    Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018; Y. Ding et al., "Revisiting the P3P Problem", CVPR
-    2023. See :mod:`kornia_pnpnet.propose.p3p`.
+    Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018 (one degenerate conic); Y. Ding, J. Yang, V. Larsson,
+    C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023 (the cubic, lines from the adjugate matrix).
 
     Args:
         world_points: points in any unit, shape :math:`(B, 3, 3)`. Any number of leading dimensions may replace
@@ -373,11 +358,11 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
             ``normalize_points_with_intrinsics`` computes these coordinates from pixels.
 
     Returns:
-        Four slots per problem. The dtype is float64 if an argument is float64, else float32. A slot is valid when its
-        pose is a solution with all three points in front of the camera. Invalid slots contain finite numbers. A double
-        solution fills one slot. A problem has no valid slot when the points lie on a line, when a coordinate is not
-        finite, or when a ray is nearly orthogonal to the optical axis. (See ``MIN_DEPTH_RATIO`` in
-        :mod:`kornia_pnpnet.refine.residual`.)
+        Four slots per problem, float64 if an argument is float64, else float32. A slot is valid when its pose is a
+        solution with all three points in front of the camera. Invalid slots contain finite numbers. A double solution
+        fills one slot. A problem has no valid slot when the points lie on a line, when a coordinate is not finite, or
+        when a ray is nearly orthogonal to the optical axis (``MIN_DEPTH_RATIO`` of
+        :mod:`kornia_pnpnet.refine.residual`).
 
     Raises:
         ShapeError: when a tensor has another shape, or the batches differ.
@@ -395,7 +380,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
         >>> bool((pose.translation[valid] - torch.tensor([0.0, 0.0, 4.0])).norm(dim=-1).min() < 1e-4)
         True
     """
-    KORNIA_CHECK_SHAPE(world_points, ["*", "3", "3"])
+    check_form(["*", "3", "3"], world_points=world_points)
     size = world_points.shape[:-2]
     check_shapes({"plane_points": (plane_points, (*size, 3, 2))}, world_points)
     check_devices({"plane_points": plane_points}, world_points)
@@ -420,9 +405,8 @@ def minimal_poses(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
-    If the focal length is unknown, :func:`p3p` solves each sample at every focal length of a grid. The grid covers the
-    range of :class:`~kornia_pnpnet.refine.terms.CameraTerm` with a constant ratio between neighbours.
-    Refinement on all inliers then finds a focal length between the points of the grid.
+    If the focal length is unknown, :func:`p3p` solves each sample at every focal length of a grid with constant ratios
+    (see :class:`~kornia_pnpnet.refine.terms.CameraTerm`). Refinement on all inliers then leaves the grid.
 
     Example:
         >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))

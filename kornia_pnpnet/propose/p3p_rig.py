@@ -6,11 +6,10 @@ direction :math:`r_k`. The unknowns are the distances :math:`d_k > 0` along the 
 
 .. math:: \|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2.
 
-These three equations have up to eight solutions (D. Nistér, "A minimal solution to the generalised 3-point pose
-problem", CVPR 2004). For a given :math:`d_1`, the equation of the pairs 1 and 2 has up to two solutions :math:`d_2`,
-and the equation of the pairs 1 and 3 has up to two solutions :math:`d_3`. These solutions are real in one interval of
-:math:`d_1`. On each of the four branches, the third equation is then a function of :math:`d_1` alone. We evaluate these
-functions at a few distances :math:`d_1`. Newton's method starts where the sign of a function changes.
+There are up to eight solutions (D. Nistér, "A minimal solution to the generalised 3-point pose problem", CVPR 2004).
+For a given :math:`d_1`, two of the equations have up to two solutions :math:`d_2` and :math:`d_3`, which are real in
+one interval of :math:`d_1`. On each of the four branches, the third equation is a function of :math:`d_1` alone. We
+evaluate these functions at a few distances. Newton's method starts where the sign of a function changes.
 
 The last dimension of every tensor is the batch of B problems or M solutions.
 """
@@ -30,9 +29,8 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3PRig"]
 
-# Number of distances at which a function is evaluated. If two solutions lie between neighbouring distances, the sign
-# does not change, and both solutions are missed. If cameras look in all directions, 16 distances miss 4 % of the poses,
-# and 32 distances miss 2 % (random samples of three exact pairs).
+# Number of distances at which a function is evaluated. Two solutions between neighbouring distances are missed. If
+# cameras look in all directions, 16 distances miss 4 % of the poses, and 32 distances miss 2 % (random exact samples).
 _DISTANCES = 16
 # Largest number of solutions, and number of Newton steps.
 _SOLUTIONS, _STEPS = 8, 6
@@ -105,7 +103,7 @@ class P3PRig:
                 eye.repeat(1, 1, _SOLUTIONS * batch).index_copy(-1, slots, torch.where(exact, rotation, eye)),
                 rays.new_zeros(3, _SOLUTIONS * batch).index_copy(-1, slots, torch.where(exact, translation, 0.0)),
             ),
-            torch.zeros_like(exact[:1]).repeat(_SOLUTIONS * batch).index_copy(0, slots, exact),
+            exact.new_zeros(_SOLUTIONS * batch).index_copy(0, slots, exact),
         )
         return map_tensors(lambda x: x.unflatten(-1, (_SOLUTIONS, batch)).movedim((-1, -2), (0, 1)), found)
 
@@ -149,10 +147,7 @@ def _starts(
 def _newton(
     world_points: Tensor, rays: Tensor, centres: Tensor, sides: Tensor, ranges: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the poses of triangles (3, 3, M) by Newton's method, which starts at the distances ``ranges`` (3, M).
-
-    Returns the rotations, the translations, and whether the equations hold and all distances are positive.
-    """
+    """Rotations, translations, and whether both are a solution, by Newton's method from the ``ranges`` (3, M)."""
     first, second = [0, 0, 1], [1, 2, 2]
     for step in range(_STEPS + 1):
         points = centres + ranges[:, None] * rays

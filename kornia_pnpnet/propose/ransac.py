@@ -26,10 +26,9 @@ __all__ = ["RANSAC", "search_on"]
 # A pose can fit this number of inliers closely even if their pixels are noisy.
 _FITTED = 5
 # Largest residuals of an inlier in :func:`search_on`, in standard deviations. The first limit is for the noise that a
-# network estimates, which is too small when most pairs are outliers. The limit is wide, because a missed inlier costs
-# more than an accepted outlier. The second limit is for the noise that the caller gave. On problems of uncertain PnP
-# (`benchmarks/uncertainty.py`, seeds 777 and 778, 10 pairs with 5 outliers), limits of 4 and 8 lead to larger
-# errors than a limit of 5.
+# network estimates, which is too small when most pairs are outliers. The second limit is for the caller's noise. On
+# problems of uncertain PnP (`benchmarks/uncertainty.py`, seeds 777 and 778, 10 pairs with 5 outliers), limits of 4 and
+# 8 lead to larger errors.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Inlier threshold of `_on_grid`, divided by two factors: the median distance of the pixels from the principal point,
 # and half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
@@ -47,15 +46,13 @@ class RANSAC(Initialiser):
     The samples of all problems are solved as one batch, in rounds. After each round the best pose of a problem is
     improved by least squares on its inliers (LO-RANSAC). A problem is done when a sample without an outlier has been
     drawn with the probability ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
-    drawn twice. Problems share only the random numbers, which are the same in every call. The result of a problem
-    therefore does not depend on the batch or on the position in the batch, up to rounding.
+    drawn twice. The random numbers are the same for every problem and in every call. The result of a problem therefore
+    does not depend on the batch, up to rounding. Pairs of a large confidence are drawn more often than other pairs.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` covers errors
-    of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points. An error of a point moves the
-    projection by :math:`f/z` times the error. In least squares, the weight of an inlier is the inverse of the
-    right-hand side. The final steps multiply this weight by the weight of a Cauchy kernel.
-
-    Pairs to which the caller gave a large confidence are drawn more often than other pairs.
+    of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points, which move the projection by
+    :math:`f/z` times the error. In least squares, the weight of an inlier is the inverse of the right-hand side. The
+    final steps multiply this weight by the weight of a Cauchy kernel.
 
     Gradients: the final least-squares steps have gradients with respect to points, pixels and weights. These steps
     start from a constant pose close to the minimum. The inliers, and their weights by depth, are constants.
@@ -135,7 +132,7 @@ class RANSAC(Initialiser):
         r"""Find the poses.
 
         Args:
-            problem: normalised problems.
+            problem: normalised problems of a centred world, because the search computes in float32.
             given: one pose per problem, in the frame of the problem. This pose competes with the poses of the samples.
 
         Returns:
@@ -154,21 +151,13 @@ class RANSAC(Initialiser):
             )
         if not compiling() and not all(map(sees_values, problem[:3])):
             raise NotImplementedError(
-                "torch.func.vmap cannot map RANSAC, whose search ends when its problems are solved. "
-                "Give the solver a larger batch: it takes any leading dimensions."
+                "RANSAC runs neither in torch.func.vmap nor on the device meta, because its search ends when its "
+                "problems are solved. In place of vmap, give the solver a larger batch with any leading dimensions."
             )
         # If tensors are contiguous, the rounding of sums over pairs does not depend on the position in the batch.
         problem = problem._replace(noise=None).map(torch.Tensor.contiguous)
-        share = (problem.usual_weights.detach() > 0).to(problem.weights)
-        share = share / share.sum(-1, keepdim=True).clamp(min=1.0)
-        centre = (share[..., None] * problem.world_points.detach()).sum(1)  # (B, 3)
         # Weights are divided by the largest weight of the problem, so that their unit has no effect.
-        weights = relative(problem.weights, problem.weights)
-        problem = problem._replace(world_points=problem.world_points - centre[:, None], weights=weights)
-        if problem.prior is not None:
-            problem = problem._replace(prior=problem.prior.recentred(centre))
-        if given is not None:
-            given = map_tensors(lambda x: x.detach()[:, None], _recentred(given, centre))
+        problem = problem._replace(weights=relative(problem.weights, problem.weights))
         fixed = problem.map(torch.Tensor.detach)
         img, world = self.threshold * fixed.img_scale, self.world_threshold * fixed.world_scale
         thresholds = Thresholds(img[:, None], world[:, None])
@@ -177,10 +166,10 @@ class RANSAC(Initialiser):
             if fixed.free_focal is not None:
                 stages = [thresholds._replace(img=thresholds.img.maximum(_on_grid(fixed))), thresholds]
             search = Search(self, fixed, stages[0], _trusted(fixed))
-            search.run(given)
+            search.run(map_tensors(lambda x: x.detach()[:, None], given))
         projection, judged = self._refined(problems_last(problem), search.state, stages)
         pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
-        return Starts(_recentred(pose, -centre), judged.weights.contiguous(), search.loss.isfinite(), camera=camera)
+        return Starts(pose, judged.weights.contiguous(), search.loss.isfinite(), camera=camera)
 
     def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[Projection, Judged]:
         """Improve poses on their inliers. Each stage selects the inliers once, by its own thresholds."""
@@ -195,11 +184,6 @@ class RANSAC(Initialiser):
         return projection, map_tensors(torch.Tensor.detach, judged)
 
 
-def _recentred(pose: Pose, centre: Tensor) -> Pose:
-    """Express poses in a world whose origin is moved to the point ``centre`` (B, 3)."""
-    return Pose(pose.rotation, pose.translation + (pose.rotation @ centre[..., None])[..., 0])
-
-
 def _on_grid(problem: Problem) -> Tensor:
     """Inlier threshold (B, 1) in pixels of the problem, for focal lengths between two values of P3P's grid."""
     away = torch.where(problem.weights > 0, problem.img_points.abs().amax(-1), torch.nan)
@@ -207,18 +191,13 @@ def _on_grid(problem: Problem) -> Tensor:
 
 
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
-    """Weights (B, N) of a Cauchy kernel. The scale of the kernel is proportional to the inliers' median residual.
-
-    Thresholds are wide, and noise has heavy tails. With equal weights, the pairs with the largest residuals would
-    dominate the pose.
-    """
+    """Weights (B, N) of a Cauchy kernel by the inliers' median residual, because thresholds are wide."""
     sq_scale, count = cauchy_scale(errors, inliers > 0)
     # With few inliers, the median residual underestimates the noise. All weights are then closer to 1.
     free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
     return 1.0 / (1.0 + free * errors / sq_scale.clamp(min=torch.finfo(errors.dtype).eps))
 
 
-# Plan of :func:`search_on`.
 _FURTHER = RANSAC(P3P(), min_samples=64)
 
 
@@ -233,18 +212,15 @@ def _trusted(problem: Problem) -> Tensor:
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, Pose]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    If a pair has the weight :math:`w` in the starts, its chance to be drawn is proportional to :math:`0.8 + 0.2 w`. A
-    large confidence of the caller increases the chance. Misleading weights cost samples, but do not prevent success.
+    A problem is searched only when it needs more than 64 samples for a confidence of 0.999, by the inliers of the best
+    pose of the starts. (Least squares on its inliers may improve the pose first.) If a pair has the weight :math:`w` in
+    the starts, its chance to be drawn is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller
+    increases the chance.
 
-    A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
-    limit is five standard deviations. If the caller gave no noise, all pairs have the mean of the estimated standard
-    deviations. A covariance is replaced by isotropic noise of the same trace. Noise of points is converted to pixels at
-    the depth of the world's origin in the first pose. If each pose used its own depths, a pose close to the points
-    would have the most inliers.
-
-    A problem is searched only when it needs more than 64 samples for a confidence of 0.999. This number is computed
-    from the inliers of the best pose of the starts. If the number exceeds 64, least squares improve this pose, and the
-    number is computed again. The result of a problem does not depend on the other problems.
+    A pair is an inlier if its residual is below ten standard deviations, or five if the caller gave the noise of the
+    pair. If the caller gave no noise, all pairs have the mean of the estimated standard deviations. Noise of points is
+    converted to pixels at the depth of the world's origin in the first pose. If each pose used its own depths, a pose
+    close to the points would have the most inliers.
 
     Args:
         problem: normalised problems of a centred and scaled world.
@@ -253,10 +229,9 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
             gave a pose or a prior, because a search on few pairs can lead away from the correct pose.
 
     Returns:
-        First, the starts with the best pose, without gradient. A searched problem has new weights, because the
-        network's weights misled the first pose. The new weights are those of a Cauchy kernel at the best pose. The
-        scale of the kernel is the inlier threshold. Second, the best pose by a quarter of the thresholds, a rival of
-        the refined pose.
+        First, the starts with the best pose, without gradient. The weights of a searched problem are those of a Cauchy
+        kernel at the best pose, with the inlier threshold as its scale, because the network's weights misled the first
+        pose. Second, the best pose by a quarter of the thresholds, a rival of the refined pose.
 
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.
@@ -282,7 +257,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     search.run(given, enough=_FURTHER.min_samples)
     state = search.state
     judged = judge(project(state, problems_last(problem)), problem, thresholds)
-    weights = torch.where((search.drawn > 0)[:, None], 1.0 / (1.0 + judged.errors), constant.weights)
+    weights = torch.where(search.drawn[:, None], 1.0 / (1.0 + judged.errors), constant.weights)
     others = starts.others if keep_others else None
     rival = map_tensors(lambda x: x.to(problem.weights), as_pose(search.rivals))
     return starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera), rival

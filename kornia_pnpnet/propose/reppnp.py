@@ -1,10 +1,9 @@
 r"""EPPnP and REPPnP: a pose from the null space of the projection equations. REPPnP also rejects outliers.
 
-The twelve unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). A pair
-gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. The algebraic errors of the pair are the
-residuals of the two equations, in the unit of the world points. In an array ``rows`` (B, K + 1, 2 N), the first K rows
-are the derivatives of the algebraic errors with respect to K unknowns. The last row is the algebraic errors. The first
-N columns are the errors in u, and the last N columns are the errors in v.
+A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residuals are the algebraic
+errors. Unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). In an array
+``rows`` (B, K + 1, 2 N), the first K rows are the derivatives of the errors by K unknowns, and the last row is the
+errors. The first N columns are the errors in u, and the last N columns are the errors in v.
 """
 
 from __future__ import annotations
@@ -25,16 +24,14 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["REPPnP"]
 
-# Outlier rejection keeps at least this number of pairs. A null vector has 11 unknowns and needs 6 pairs. A rigid motion
-# has 6 unknowns and needs 3 pairs. One or two further pairs give outliers a residual.
+# Outlier rejection keeps at least this number of pairs: the 6 pairs of a null vector, or the 3 pairs of a rigid motion,
+# and one or two further pairs.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
 # A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4
-# Ridge on the depths of the control vectors during outlier rejection. On the protocol's problems, all values from
-# 1e-3 to 3e-2 give the same success.
-_DEPTH_PRIOR = 5e-3
-# Ridge on the same depths after outlier rejection. A larger ridge would suppress the small depths of a narrow view.
-_FINAL_DEPTH_PRIOR = 1e-5
+# Ridges on the depths of the control vectors during and after outlier rejection. On the protocol's problems, all values
+# from 1e-3 to 3e-2 give the same success. In the end, a large ridge would suppress the small depths of a narrow view.
+_DEPTH_PRIOR, _FINAL_DEPTH_PRIOR = 5e-3, 1e-5
 # Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
 # This number is added to 1 minus the leverage of a pair, because the leverage can be 1.
@@ -227,10 +224,10 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
 
 
 def _leave_one_out(rows: Tensor, inverse: Tensor, pairs: _Pairs, weights: Tensor) -> Tensor:
-    r"""Squared leave-one-out errors (B, N): change of the cost if a kept pair is removed or a rejected pair is added.
+    r"""Squared leave-one-out errors :math:`e^\top (1 \mp w H)^{-1} e` (B, N) with the leverage :math:`H`.
 
-    The change is divided by the weight :math:`w` of the pair. The result is :math:`e^\top (1 \mp w H)^{-1} e`, where
-    :math:`e` are the two errors and :math:`H` is the leverage. The sign is minus for kept pairs, else plus.
+    This is the change of the cost, over the weight :math:`w`, if a kept pair is removed (minus) or a rejected pair is
+    added (plus).
     """
     jacobian, count = rows[:, :-1], weights.shape[-1]
     solved = inverse @ jacobian

@@ -1,7 +1,4 @@
-r"""Draw the samples of RANSAC, and compute how many samples suffice.
-
-Problems share only the random numbers. The samples of a problem do not depend on the rest of the batch.
-"""
+"""Draw samples of pairs, and compute how many samples suffice. Problems share only the random numbers."""
 
 from __future__ import annotations
 
@@ -16,17 +13,17 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet.core.performance import present_first
 
-__all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed"]
+__all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed", "spread_evenly"]
 
-# Number of nearest neighbours of a pair that are compared.
-_NEIGHBOURS = 16
-# Neighbours are searched among at most this number of pairs, which are a subsample spread evenly over all pairs. The
-# cost is therefore linear in the number of pairs. The number must be a power of two.
-_CANDIDATES = 512
+# Number of nearest neighbours of a pair that are compared. They are searched among at most the second number of pairs,
+# so that the cost is linear in the number of pairs. The second number must be a power of two.
+_NEIGHBOURS, _CANDIDATES = 16, 512
 # The bits of an infinite float32.
 _INFINITE = 0x7F800000
 # Number of distances that are computed at once on a CPU, so that they fit into a core's cache.
 _BLOCK = 2**18
+# Fractional parts of the multiples of the golden ratio are spread evenly over the unit interval.
+_GOLDEN = 0.6180339887
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
@@ -34,17 +31,24 @@ def kept_at_once(count: int, like: Tensor) -> int:
     return count if like.device.type == "cpu" else 64 * count
 
 
+@torch.no_grad()
+def spread_evenly(present: Tensor, count: int) -> Tensor:
+    """Positions (B, count) of present pairs, evenly spread. If these pairs are too few, absent pairs are added.
+
+    Multiples of the golden ratio shift the positions, because the selection could follow a periodic pattern in the
+    order of the pairs. The shifts are small: no position occurs twice, unless fewer than ``count`` pairs exist.
+    """
+    steps = torch.arange(count, dtype=torch.float64, device=present.device)
+    total = present.sum(1, keepdim=True).clamp(min=count)
+    most = ((1.0 - count / total) / (1.0 - _GOLDEN)).clamp(max=1.0)
+    spread = (steps + most * ((_GOLDEN * steps) % 1.0)) * (total / count)
+    return present_first(present).gather(1, spread.long().clamp(max=present.shape[1] - 1))
+
+
 def draw(numbers: Tensor, upper: Tensor) -> Tensor:
-    """Draw subsets of items without replacement.
+    """Draw subsets (P, H, s) without replacement. Items of probability 0 are drawn only if no others are left.
 
-    Items of probability 0 are drawn only when too few items have a positive probability.
-
-    Args:
-        numbers: random numbers, uniform in [0, 1), float64, shape (H, s).
-        upper: cumulative probabilities of the items of each problem, float64, shape (P, N).
-
-    Returns:
-        Positions of the items, shape (P, H, s).
+    ``numbers`` (H, s) are uniform in [0, 1). ``upper`` (P, N) are the cumulative probabilities of the items.
     """
     lower = torch.cat((torch.zeros_like(upper[:, :1]), upper[:, :-1]), 1)
     chosen: list[tuple[Tensor, Tensor]] = []  # starts and lengths of the intervals of drawn items, ascending
@@ -69,24 +73,17 @@ def draw(numbers: Tensor, upper: Tensor) -> Tensor:
 def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Tensor) -> Tensor:
     r"""Agreement (B, N) between each pair's nearest neighbours in the image and its nearest neighbours in the world.
 
-    Points that are close in the image are mostly close in the world. An inlier therefore has common neighbours in both
-    spaces. An outlier has common neighbours only by chance. The 16 nearest neighbours of each pair are compared. Let a
-    common neighbour have the rank :math:`a` in the image and the rank :math:`b` in the world, counted from 0. This
-    neighbour adds :math:`1 / (1 + \max(a, b))` to the agreement. Pairs with equal pixels or equal points do not count
-    as neighbours, because such pairs often repeat one incorrect match.
+    An inlier has common neighbours in both spaces, an outlier only by chance. A common neighbour with the rank
+    :math:`a` in the image and the rank :math:`b` in the world adds :math:`1 / (1 + \max(a, b))` to the agreement. Pairs
+    with equal pixels or equal points do not count, because such pairs often repeat one incorrect match.
 
     Source: J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature correspondence", CVPR 2017
     (the idea, for matches between two images).
-
-    Args:
-        world_points: shape :math:`(B, N, 3)`.
-        img_points: shape :math:`(B, N, 2)`.
-        there: which pairs have a positive weight, bool, shape :math:`(B, N)`.
     """
     counts, width = there.sum(-1, keepdim=True), min(there.shape[1], _CANDIDATES)
     order = torch.arange(width, dtype=torch.int32, device=there.device)
-    at = present_first(there).gather(1, order * counts.clamp(min=width) // width)  # (B, W)
-    rank = torch.arange(min(_NEIGHBOURS, width), device=there.device)
+    at = spread_evenly(there, width)  # (B, W)
+    rank = torch.arange(min(_NEIGHBOURS, width), dtype=torch.float32, device=there.device)
     score = (1.0 + torch.maximum(rank[:, None], rank)).reciprocal().flatten()
     absent = (order >= counts)[:, None]
     world_points, img_points = world_points.float(), img_points.float()
@@ -111,52 +108,42 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
 
 
 class Samples:
-    """The samples that RANSAC tries, for every problem of a batch.
-
-    If a problem has at most ``most`` subsets of ``size`` pairs, each subset is one sample. The order of these samples
-    is random. Otherwise ``most`` samples are drawn at random.
+    """The samples that RANSAC tries: each subset of pairs in a random order, or ``most`` samples if there are more.
 
     Args:
-        there: which pairs have a positive weight, bool (B, N).
+        chances: relative chances that pairs are drawn, (B, N); 0: never.
         size: number of pairs in a sample.
         most: largest number of samples.
         seed: seed of the random numbers, which are the same for every problem.
-        chances: relative chances, at least 0, that pairs are drawn, (B, N); ``None``: equal chances.
 
     Attributes:
-        counts: number of pairs that have a positive weight, (B,).
+        counts: number of pairs that have a positive chance, (B,).
         totals: number of samples of each problem, (B,).
 
     Example:
-        >>> samples = Samples(torch.ones(1, 4, dtype=torch.bool), size=3, most=10, seed=0)
+        >>> samples = Samples(torch.ones(1, 4), size=3, most=10, seed=0)
         >>> samples.totals.tolist(), sorted(samples.positions(torch.tensor([0]), 0, 4)[0].tolist())
         ([4], [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
     """
 
-    def __init__(self, there: Tensor, *, size: int, most: int, seed: int, chances: Tensor | None = None) -> None:
-        device = there.device
-        self.size = size
+    def __init__(self, chances: Tensor, *, size: int, most: int, seed: int) -> None:
+        there, device, self.size = chances > 0, chances.device, size
         self.counts = there.sum(-1)
         self._order = present_first(there)
-        subsets = [math.comb(n, size) for n in range(there.shape[1] + 1)]
-        of_problem = torch.tensor(subsets, dtype=torch.float64, device=device)[self.counts]
-        self.totals = of_problem.clamp(max=most).long()
-        self._enumerated = of_problem <= most
+        subsets = [min(math.comb(n, size), most + 1) for n in range(there.shape[1] + 1)]
+        self.totals = torch.tensor(subsets, device=device)[self.counts]
+        self._enumerated = self.totals <= most
+        self.totals.clamp_(max=most)
         kinds, self._kinds = self.counts.where(self._enumerated, size).unique(return_inverse=True)
         tables = [_subsets(n, size, seed) for n in kinds.tolist()] or [_subsets(size, size, seed)]
         self._tables = pad_sequence(tables, batch_first=True).to(device)  # (K, L, s)
         self._numbers = None if bool(self._enumerated.all()) else _random_numbers(size, most, seed).to(device)
-        share = there.double()
-        if chances is not None:
-            share = share * torch.where(self._enumerated[:, None], 1.0, chances)
+        share = torch.where(self._enumerated[:, None], there, chances.double())
         self._share = share / share.sum(-1, keepdim=True).clamp(min=torch.finfo(share.dtype).tiny)
         self._upper = self._share.gather(1, self._order).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        """Positions (P, H, s) of the pairs in the samples ``start`` to ``stop - 1`` of some problems (P,).
-
-        If a problem has fewer than ``stop`` samples, its first samples are repeated.
-        """
+        """Positions (P, H, s) of the pairs in the samples ``start`` to ``stop - 1``, or repeats, of problems (P,)."""
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
         if self._numbers is not None:
@@ -167,8 +154,8 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        With unequal chances, the inverse of the inliers' mean chance replaces the number of pairs. The chances of a
-        problem have the sum 1. The mean is weighted by the chances themselves.
+        With unequal chances, the inverse of the inliers' mean chance (weighted by the chances) replaces the number of
+        pairs.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
@@ -176,17 +163,16 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Select ``count`` pairs, spread evenly over the pairs of positive weight. Returns positions (P, count).
+        """Positions (P, count) of pairs in proportion to their chances, spread over the image.
 
-        The selected pairs are spread over the image, because :class:`~kornia_pnpnet.frame.Normalize` orders pairs by
-        their pixels. Pairs are selected in proportion to their chances.
+        (:class:`~kornia_pnpnet.frame.Normalize` orders pairs by their pixels.)
         """
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
         return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
 
     def _present(self, problems: Tensor, ranks: Tensor) -> Tensor:
-        """Convert ranks (P, ...) among the pairs of positive weight to positions in the problems."""
+        """Convert ranks (P, ...) among the pairs of positive chance to positions in the problems."""
         return self._order[problems].gather(1, ranks.flatten(1)).view_as(ranks)
 
 
@@ -204,24 +190,16 @@ def _subsets(count: int, size: int, seed: int) -> Tensor:
 
 
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:
-    r"""Number of samples needed for a probability :math:`p` that at least one sample has no outlier, float64 (B,).
+    r"""Number of samples needed for a probability ``confidence`` that at least one sample has no outlier, float64 (B,).
 
     The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
-    without an outlier.
-
-    Args:
-        inliers: number :math:`k` of inliers, not necessarily an integer, shape (B,).
-        counts: number :math:`c` of pairs, not necessarily an integer, shape (B,).
-        size: number :math:`s` of pairs in a sample.
-        confidence: the probability :math:`p`.
-
-    Source: M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B.
+    without an outlier for :math:`k` inliers of :math:`c` pairs, not necessarily integers (M. Fischler and R. Bolles,
+    "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B).
 
     Example:
         >>> samples_needed(torch.tensor([9, 6, 2]), torch.tensor([9, 9, 9]), 3, 0.999)
         tensor([ 0.0000, 25.4023,     inf], dtype=torch.float64)
     """
-    share = torch.ones_like(inliers, dtype=torch.float64)
-    for j in range(size):
-        share = share * (inliers - j).clamp(min=0) / (counts - j).clamp(min=1)
-    return math.log1p(-confidence) / torch.log1p(-share.clamp(max=1.0))
+    drawn = torch.arange(size, dtype=torch.float64, device=inliers.device)
+    shares = (inliers[:, None] - drawn).clamp(min=0.0) / (counts[:, None] - drawn).clamp(min=1.0)
+    return math.log1p(-confidence) / torch.log1p(-shares.prod(-1).clamp(max=1.0))

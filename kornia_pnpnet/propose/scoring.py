@@ -1,11 +1,11 @@
 r"""Compute the losses of thousands of poses per problem at once.
 
-To add a loss function, add an entry to :data:`SCORERS`. The *standardised* squared residual :math:`e` of a pair is its
-squared residual divided by the squared threshold, see :mod:`kornia_pnpnet.judge.inliers`. To avoid the division by the
-depth :math:`z`, this module multiplies numerator and denominator by :math:`(z/f)^2`. One matrix product then projects
-all points at all poses. A pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame have the residual
+A pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame have the standardised squared residual (see
+:mod:`kornia_pnpnet.judge.inliers`; numerator and denominator are multiplied by :math:`(z/f)^2`)
 
 .. math:: e = \frac{(x - z\,b_u/f)^2 + (y - z\,b_v/f)^2}{(z \tau / f)^2 + \omega^2}
+
+One matrix product projects all points at all poses.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 #: Maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
-# The squared distance of a point behind the camera is increased by this number times the distance behind the camera.
-# The residual of the point then exceeds MAX_ERROR.
+# The squared distance of a point behind the camera is increased by this number times the distance, beyond MAX_ERROR.
 _BEHIND = 1e15
 
 
@@ -44,7 +43,7 @@ def _outliers(error: Tensor) -> Tensor:
     return (error >= 1.0).to(error.dtype)
 
 
-#: Loss functions by name. The loss of a residual at or above the threshold is 1. Lambdas cannot be pickled.
+#: Loss functions by name. The loss of a residual at or above the threshold is 1.
 SCORERS: dict[str, Scorer] = {"msac": _truncated, "inliers": _outliers}
 
 

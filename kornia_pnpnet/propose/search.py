@@ -7,7 +7,6 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import compiling, present_first
@@ -23,41 +22,43 @@ from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, p
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
-__all__ = ["CAUCHY", "Plan", "Search", "cauchy_scale", "least_squares"]
+__all__ = ["CAUCHY", "Search", "cauchy_scale", "least_squares"]
 
 #: Scale of the Cauchy kernel in standard deviations.
 CAUCHY = 3.4
 
 # Poses are compared and improved in this dtype. At a focal length of 3400 px, rounding errors are about 1e-4 px.
 _DTYPE = torch.float32
-# On a CPU, at most this number of samples is solved and scored at once, so that the tensors fit into a core's caches.
-_SAMPLES_AT_ONCE = 4096
-# Let a and b be these numbers. After k samples, the first scoring of a round (see `Search._round`) uses the maximum of
-# a and b * k^(1/3) pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below the
-# bound (7 / k)^(1/3). At this bound, 3 / w pairs contain at least one inlier with a probability of 95 %.
+# On a CPU, at most the first number of samples is solved and scored at once, so that the tensors fit into a core's
+# caches. A round has at most the second number of samples.
+_SAMPLES_AT_ONCE, _LARGEST_ROUND = 8192, 4096
+# After k samples, the first scoring of a round uses the maximum of the first number and the second number * k^(1/3)
+# pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then
+# 3 / w pairs contain at least one inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
 # were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
+# Slots times pairs of a problem. Up to this number, scoring the empty slots of samples is faster than removing them.
+_FEW_RESIDUALS = 4096
 # In each round, this number of poses with the smallest losses is improved. The best of them is then improved again.
 _IMPROVED = 3
-# Number of samples in a round, divided by the number of samples before the round. A larger ratio would reduce the
-# number of rounds, but would draw more samples than necessary.
+# Number of samples in a round, divided by the number of samples before the round.
 _GROWTH = 0.5
-# If the remaining samples would take at most this number of rounds, one round draws all of them.
-_FEW_LEFT = 2.0
+# One round draws all remaining samples if they would take at most this number of rounds, or if they are few. With 9
+# pairs, 84 samples in one round take as long as two rounds. (An unknown focal length multiplies the time of a sample.)
+_ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
 # Squared ratio of the thresholds to the narrower thresholds of a rival.
 _NARROWER = 16.0
 # Relative damping of a least-squares step. Almost no damping is needed, because the start is close to the minimum.
 _DAMPING = 1e-6
-# Factors of the inlier threshold in the first and in the second least-squares step. The first factor is larger, because
-# inliers have larger residuals at the pose of a minimal sample than at an improved pose.
+# Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
+# the pose of a minimal sample than at an improved pose.
 _LIMITS = 3.0, 1.0
 # If `pose_sigma` exceeds the first number, at least the second number of samples is drawn. An incorrect pose may then
-# have as many inliers as the correct pose, for example in a flat scene and a narrow field of view. The first number
-# corresponds to a standard deviation of the rotation of 0.6 degrees, or less if the translation is uncertain, too.
+# have as many inliers as the correct pose, for example in a flat scene and a narrow field of view.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
 # After this number of samples, pairs with a large `agreement_of_neighbours` are drawn more often. Computing the
 # agreement takes about as long as solving this number of samples.
@@ -97,8 +98,7 @@ class Search:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
         rivals: the best pose of each problem by a quarter of the thresholds, not improved, shape :math:`(B, 12)`.
-        scored: number of scored poses, int64, shape :math:`(B,)`.
-        drawn: number of drawn samples, int64, shape :math:`(B,)`.
+        drawn: whether samples of a problem were drawn, bool, shape :math:`(B,)`.
 
     Example:
         >>> from kornia_pnpnet.propose.p3p import P3P
@@ -108,8 +108,8 @@ class Search:
         >>> problem = Problem.of(points, 100.0 * cam_points[..., :2] / cam_points[..., 2:], 100.0)
         >>> search = Search(RANSAC(P3P()), problem, Thresholds(points.new_ones(1, 1), points.new_zeros(1, 1)))
         >>> search.run()
-        >>> round(search.state.pose.translation[0, 2].item(), 3), search.drawn
-        (5.0, tensor([20]))
+        >>> round(search.state.pose.translation[0, 2].item(), 3)
+        5.0
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Search:
     ) -> None:
         self.finds_rivals = finds_rivals
         self.plan, self.problem = plan, problem
-        self.chances = torch.ones_like(problem.weights) if chances is None else chances
+        self.chances = (problem.weights > 0) * (torch.ones_like(problem.weights) if chances is None else chances)
         self.minimal = plan.minimal if problem.rig is None else P3PRig()
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
@@ -137,9 +137,8 @@ class Search:
         self.poses = torch.eye(3, 4, dtype=_DTYPE, device=self.low.device).flatten().repeat(batch, 1)
         self.rivals = self.poses.clone()
         self.loss = self.low.new_full((batch,), torch.inf)
-        self.rival_loss = self.loss.clone()
-        self.needed = self.loss.double()
-        self.scored, self.drawn = torch.zeros(2, batch, dtype=torch.int64, device=self.low.device)
+        self.rival_loss, self.needed = self.loss.clone(), self.loss.double()
+        self.drawn = torch.zeros_like(self.loss, dtype=torch.bool)
 
     @property
     def state(self) -> State:
@@ -149,7 +148,7 @@ class Search:
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
         return State(Pose(rotation, pose.translation), camera)
 
-    def run(self, given: Pose | None = None, enough: int = 0) -> None:
+    def run(self, given: Pose | None = None, enough: float = -1.0) -> None:
         """Search each problem until its samples suffice for the plan's confidence, or until all samples are drawn.
 
         Args:
@@ -163,17 +162,16 @@ class Search:
         active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
         if given is not None and len(active):
             poses = as_entries(given)[active].to(_DTYPE).mT
-            scene = take(self.scene, active)
-            losses = scene.losses(poses, self.plan.score)
-            self._find_rivals(active, scene, poses, torch.ones_like(losses) > 0)
-            self.scored[active] += losses.shape[1]
-            self.loss[active], best = losses.min(1)
-            self.poses[active] = poses.mT[torch.arange(len(best), device=best.device), best]
+            valid = torch.ones_like(poses[:, 0], dtype=torch.bool)
+            losses, poses = self._compared(active, take(self.scene, active), poses, valid)
+            self.loss[active], self.poses[active] = losses[:, 0], poses[..., 0]
             self._expect(active)
             hard = self.needed[active] > enough
-            self._improve(active[hard], losses[hard], poses[hard])
-            self._expect(active[hard])
-            active = active[self.needed[active] > enough] if enough else active
+            active = active[hard]
+            self._improve(active, losses[hard], poses[hard])
+            self._expect(active)
+            active = active[self.needed[active] > enough]
+        self.drawn[active] = True
         start = stop = 0
         while len(active):
             if start < _PLAIN_SAMPLES <= stop and self.problem.rig is None:
@@ -182,11 +180,11 @@ class Search:
             start, stop = stop, self._end_of_round(stop, int(totals[active].max()))
             parts = active.split(max(1, kept_at_once(_SAMPLES_AT_ONCE, active) // (stop - start)))
             losses, poses = map_tensors(lambda *x: torch.cat(x), *(self._round(x, start, stop) for x in parts))
-            self.drawn[active] = totals[active].clamp(max=stop)
             better = losses[:, 0] < self.loss[active]
             self._improve(active[better], losses[better], poses[better])
-            self._expect(active[better & (totals[active] > stop)])
-            active = active[totals[active] > stop]
+            unfinished = totals[active] > stop
+            self._expect(active[better & unfinished])
+            active = active[unfinished]
             active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
 
     def run_once(self, positions: Tensor, judges: Tensor) -> None:
@@ -205,7 +203,7 @@ class Search:
         self.loss, self.poses = self._improved(problems, losses, poses)
 
     def _state(self, poses: Tensor) -> State:
-        """Convert stored poses (R, 12), see :class:`Search`, to states."""
+        """Convert stored poses (R, 12) to states."""
         if self.problem.free_focal is None:
             return State.of(as_pose(poses))
         first, last = poses.split((8, 4), 1)
@@ -228,8 +226,7 @@ class Search:
         return problem, take(self.thresholds, rows), project(self._state(poses), problem)
 
     def _samples(self, chances: Tensor) -> Samples:
-        plan, there = self.plan, self.problem.weights > 0
-        return Samples(there, size=self.minimal.sample_size, most=plan.max_samples, seed=plan.seed, chances=chances)
+        return Samples(chances, size=self.minimal.sample_size, most=self.plan.max_samples, seed=self.plan.seed)
 
     def _prefer_agreement(self, problems: Tensor) -> None:
         """Multiply the chances of the pairs of some problems by the agreement of their neighbours."""
@@ -242,9 +239,8 @@ class Search:
     def _expect(self, at: Tensor) -> None:
         """Estimate how many samples some problems need, from the inliers of their best poses.
 
-        After `_prefer_agreement`, the result is the geometric mean of two numbers of samples: with pairs drawn by the
-        agreement of their neighbours, and with equally likely pairs. On repeated structure, neighbours of outliers
-        agree, and the first number alone could end the search early.
+        After `_prefer_agreement`, this is the geometric mean of the numbers with and without agreement. On repeated
+        structure, neighbours of outliers agree, and the first number alone could end the search early.
         """
         if not len(at):
             return
@@ -263,9 +259,10 @@ class Search:
         self.needed[at] = needed
 
     def _end_of_round(self, done: int, total: int) -> int:
-        """Number of samples at the end of the next round. If few samples remain, the round draws all of them."""
-        size = min(max(self.plan.min_samples, int(_GROWTH * done)), _SAMPLES_AT_ONCE)
-        return total if done + size * _FEW_LEFT >= total and total - done <= _SAMPLES_AT_ONCE else done + size
+        """Number of samples at the end of the next round."""
+        size = min(max(self.plan.min_samples, int(_GROWTH * done)), _LARGEST_ROUND)
+        most = max(_ROUNDS_LEFT * size, _FEW_SAMPLES if self.problem.free_focal is None else 0)
+        return total if total - done <= min(most, _LARGEST_ROUND) else done + size
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
         """Find the best poses (P, 12, K) of the samples ``start`` to ``stop - 1``, and their ascending losses (P, K).
@@ -273,67 +270,52 @@ class Search:
         If a problem has many pairs, a few pairs score all poses first. More pairs then score the best poses. The number
         of first pairs increases with ``start``, because after many samples without success inliers are rare.
         """
-        poses, valid = self._solved(problems, self.samples.positions(problems, start, stop), start)
+        poses, valid = self._solved(problems, self.samples.positions(problems, start, stop))
+        if valid.shape[1] * self.low.shape[1] > _FEW_RESIDUALS:
+            slots = present_first(valid)[:, : max(1, int(valid.sum(1).max()))]
+            poses, valid = poses.gather(2, slots[:, None].expand(-1, 12, -1)), valid.gather(1, slots)
         scene, width = take(self.scene, problems), poses.shape[-1]
         pairs = max(_FIRST_PAIRS, math.ceil(_PAIRS_BY_SAMPLES * start ** (1 / 3)))
         while 2 * pairs <= self.low.shape[1]:
             width = max(width // _KEPT_ONE_IN, _IMPROVED)
             _, poses, valid = self._best_of(scene.pairs(self.samples.spread(problems, pairs)), poses, valid, width)
             pairs *= _MORE
-        self._find_rivals(problems, scene, poses, valid)
-        return self._best_of(scene, poses, valid, _IMPROVED)[:2]
+        return self._compared(problems, scene, poses, valid)
 
-    def _find_rivals(self, problems: Tensor, scene: Scene, poses: Tensor, valid: Tensor) -> None:
-        """Store the poses (P, 12, W) with the smallest losses by narrower thresholds, if the search finds rivals."""
-        if not self.finds_rivals:
-            return
-        losses = scene.losses(poses, self.plan.score, _NARROWER).masked_fill(~valid, torch.inf)
-        loss, best = losses.min(1)
-        better = loss < self.rival_loss[problems]
-        rows, best = problems[better], best[better]
-        self.rival_loss[rows] = loss[better]
-        self.rivals[rows] = poses[better].mT[torch.arange(len(best), device=best.device), best]
-
-    def _solved(self, problems: Tensor, positions: Tensor, start: int | None = None) -> tuple[Tensor, Tensor]:
-        """Solve samples (P, H, s) of some problems. Returns poses (P, 12, W), and which poses are solutions, (P, W).
-
-        ``start`` is the index of the first sample. If given, solutions precede invalid poses, and ``scored`` counts the
-        solutions. Samples after the last sample of a problem are then ignored.
-        """
-        batch, count, size = positions.shape
+    def _solved(self, problems: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Solve samples (P, H, s) of some problems: poses (P, 12, S H), and which poses are solutions, (P, S H)."""
+        each = positions.shape[:2]
         rows = full_vectors((positions + problems[:, None, None] * self.pairs.shape[1]).flatten(0, 1))  # (R, s)
-        values = self.pairs.flatten(0, 1).index_select(0, rows.flatten()).unflatten(0, (-1, size))
-        owners = full_vectors(problems.repeat_interleave(count))
+        values = self.pairs.flatten(0, 1).index_select(0, rows.flatten()).unflatten(0, rows.shape)
+        owners = full_vectors(problems.repeat_interleave(each[1]))
         pose, valid = self.minimal.hypotheses(self._unpacked(values.permute(2, 1, 0), owners))
-        valid = valid[: batch * count].unflatten(0, (batch, count)).mT  # (P, S, H)
         # The components of a pose come first, as in the memory of p3p's result, so that each component is contiguous.
         pose = map_tensors(lambda x: x.movedim((0, 1), (-1, -2)), pose)
         poses = torch.cat((pose.rotation, pose.translation[:, None]), 1).flatten(0, 1).to(_DTYPE)  # (12, S, R)
-        if start is None:
-            return poses.unflatten(-1, (batch, count)).movedim(2, 0).flatten(2), valid.flatten(1)
-        numbers = torch.arange(start, start + count, device=problems.device)
-        valid = (valid & (numbers < self.samples.totals[problems, None])[:, None]).flatten(1)
-        found = valid.sum(1)
-        self.scored[problems] += found
-        # The width is the largest number of solutions of a problem, rounded up to a multiple of `_VECTOR`.
-        width = max(1, -(-int(found.max()) // _VECTOR)) * _VECTOR
-        at = present_first(functional.pad(valid, (0, width)))[:, :width]
-        valid = torch.arange(width, device=at.device) < found[:, None]
-        at = torch.where(valid, at, 0)
-        at = at // count * len(rows) + at % count + count * torch.arange(batch, device=at.device)[:, None]
-        return poses.flatten(1).index_select(1, at.flatten()).unflatten(1, at.shape).movedim(1, 0), valid
+        poses, valid = (x[..., : each[0] * each[1]].unflatten(-1, each) for x in (poses, valid.mT))
+        return poses.movedim(2, 0).flatten(2), valid.movedim(1, 0).flatten(1)
 
-    def _best_of(self, judges: Scene, poses: Tensor, valid: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _compared(self, problems: Tensor, scene: Scene, poses: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Select the best of poses (P, 12, W): ascending losses (P, K), and poses (P, 12, K). Store better rivals."""
+        if self.finds_rivals:
+            loss, rival, _ = self._best_of(scene, poses, valid, 1, narrower=_NARROWER)
+            better = loss[:, 0] < self.rival_loss[problems]
+            at = problems[better]
+            self.rival_loss[at], self.rivals[at] = loss[better, 0], rival[better, :, 0]
+        return self._best_of(scene, poses, valid, _IMPROVED)[:2]
+
+    def _best_of(
+        self, judges: Scene, poses: Tensor, valid: Tensor, width: int, narrower: float = 1.0
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Select the K poses with the smallest losses: ascending losses (P, K), poses (P, 12, K), validity (P, K)."""
-        losses = judges.losses(poses, self.plan.score).masked_fill(~valid, torch.inf)
+        losses = judges.losses(poses, self.plan.score, narrower).masked_fill(~valid, torch.inf)
         losses, order = losses.topk(min(width, losses.shape[1]), largest=False)
         return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
 
     def _improved(self, problems: Tensor, losses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
         """Improve poses (P, 12, K) by a least-squares step on their inliers, and the best new pose by a second step.
 
-        A step that does not lower the loss of a pose is undone. The loss of an invalid pose remains infinite. Returns
-        the losses (P,) and the entries (P, 12) of the best poses.
+        A step that does not lower the loss is undone. Returns the losses (P,) and entries (P, 12) of the best poses.
         """
         number, pairs = problems.shape[0], self.low.shape[1]
         problems, losses, poses = (full_vectors(x, pairs) for x in (problems, losses, poses))
@@ -377,13 +359,7 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
 
 
 def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
-    """Compute the squared scale of a Cauchy kernel from the median residual, and count the used pairs, both (B, 1).
-
-    Args:
-        sq_residuals: squared residuals, shape (B, N).
-        there: which pairs are used, bool, shape (B, N). If a problem uses no pair, its scale is infinite.
-        fitted: see :func:`~kornia_pnpnet.judge.inliers.median_residual`.
-    """
+    """Squared scale (B, 1) of a Cauchy kernel, and number (B, 1) of pairs, for the arguments of `median_residual`."""
     median = median_residual(sq_residuals, there, fitted)  # median / (2 log 2) is the variance of a coordinate
     return CAUCHY**2 / (2.0 * math.log(2.0)) * median, there.sum(-1, keepdim=True, dtype=median.dtype)
 
@@ -391,8 +367,7 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
     """Repeat the first row until the number of rows is a multiple of `_VECTOR`, unless each row has many pairs.
 
-    Processors round differently in partly filled vectors. With full vectors, the poses of a sample do not depend on the
-    position in the batch. Repeating rows with many pairs would take too long.
+    Processors round differently in partly filled vectors. A result would depend on the position in the batch.
     """
     if compiling() or pairs > _VECTOR:
         return rows

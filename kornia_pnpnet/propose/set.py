@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TypeVar
 
 import torch
@@ -16,6 +17,7 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.p3p import minimal_poses
+from kornia_pnpnet.propose.sampling import spread_evenly
 from kornia_pnpnet.propose.view import LEAST_NOISE, LOG_NOISE, View, repeats
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO, project
 from kornia_pnpnet.result import Pose
@@ -37,8 +39,7 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 # Each entry is a number of pairs and a factor. Problems with at least this number of pairs have the samples above
 # again, with all ranks multiplied by the factor. These samples help if the likeliest pairs are outliers of one pose.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
-# Problems with at least 36 pairs have 25 further samples. Each of the 25 likeliest pairs is in three of these samples.
-# No two of these samples have two pairs in common.
+# Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two of them share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
 # The 32 likeliest pairs score each hypothesis.
@@ -52,12 +53,9 @@ _JUDGED = 50.0
 _LEAST_DEPTH = 0.5
 # Score of a pair with the likelihood 0, relative to the score of a pair with the likelihood 1.
 _LEAST_VOTE = 0.5
-# Before a search the network sees at most 48 pairs; the search uses all pairs. We measured success on real matches
-# (`raw/by_image.npz`, see docs/results) and on random problems of up to 1000 pairs. With 32 to 96 pairs the network has
-# the same success as with all pairs.
+# Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches (`raw/by_image.npz`, see
+# docs/results) and random problems of up to 1000 pairs, 32 to 96 pairs have the same success as all pairs.
 _ENOUGH = 48
-# Fractional parts of the multiples of the golden ratio are spread evenly over the unit interval.
-_GOLDEN = 0.6180339887
 
 
 def _taken(tree: _T, index: Tensor) -> _T:
@@ -69,20 +67,6 @@ def _taken(tree: _T, index: Tensor) -> _T:
         return x.gather(1, index if x.ndim == 2 else index[..., None].expand(-1, -1, x.shape[2]))
 
     return map_tensors(take, tree)
-
-
-@torch.no_grad()
-def _some_of(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of present pairs, evenly spread. If these pairs are too few, absent pairs are added.
-
-    Multiples of the golden ratio shift the positions. Otherwise the selection could follow a periodic pattern in the
-    order of the pairs. The shifts are small, so that no position occurs twice.
-    """
-    steps = torch.arange(count, dtype=torch.float64, device=present.device)
-    total = present.sum(1, keepdim=True).clamp(min=count)
-    most = ((1.0 - count / total) / (1.0 - _GOLDEN)).clamp(max=1.0)
-    spread = (steps + most * ((_GOLDEN * steps) % 1.0)) * (total / count)
-    return present_first(present).gather(1, spread.long())
 
 
 @torch.no_grad()
@@ -108,6 +92,17 @@ def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, t
     spread = [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in likeliest]
     ring = [(_RING_FROM, sample) for sample in _RING]
     return [(least, sample) for least, sample in (*likeliest, *spread, *ring) if least <= count]
+
+
+@cache
+def _sample_table(count: int, number: int, search_follows: bool, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Positions (3 S,) and least numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
+
+    A CUDA graph cannot contain a copy from the CPU.
+    """
+    least, samples = zip(*_samples(count, number, search_follows), strict=True)
+    with torch.inference_mode(False):  # later calls may need gradients
+        return torch.tensor(samples, device=device).mT.flatten(), torch.tensor(least, device=device)[:, None]
 
 
 def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
@@ -172,23 +167,18 @@ class SetInit(Initialiser):
     In every residual layer, attention pools a context over all pairs. The cost is linear in the number of pairs, and
     the order of the pairs has no effect. For each hypothesis, the network predicts a weight and a distance of each
     point from the camera. The pose is the rigid motion that aligns the world points with the points at these distances.
-    Poses are equivariant to similarity transforms of the world, and to rotations of the camera except the roll. The
-    intrinsics affect only the rays.
+    Poses are equivariant to similarity transforms of the world, and to rotations of the camera except the roll.
 
     The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`). The 32
     likeliest pairs score the poses of the samples. The best pose is a further hypothesis, and has no gradient.
 
     The weight of a pair is the estimated probability that the pair is an inlier. The network also estimates unknown
-    noise. A covariance is replaced by isotropic noise with the same trace. The layers compute in the dtype of the
-    network's weights, and all other operations use the dtype of the correspondences.
+    noise. The layers compute in the dtype of the network's weights, all other operations in that of the pairs.
 
-    The design is ours. Three ideas are from the literature:
-
-    - distances along rays, followed by alignment: J. Hesch and S. Roumeliotis, "A direct least-squares method for PnP",
-      ICCV 2011;
-    - attention pooled over correspondences: W. Sun et al., "ACNe: Attentive context normalization for robust
-      permutation-equivariant learning", CVPR 2020;
-    - the samples: P. Turán's problem for (6, 4, 3), 1941.
+    The design is ours. From the literature are distances along rays followed by alignment (J. Hesch and S. Roumeliotis,
+    "A direct least-squares method for PnP", ICCV 2011), attention pooled over correspondences (W. Sun et al., "ACNe:
+    Attentive context normalization for robust permutation-equivariant learning", CVPR 2020), and the samples (P.
+    Turán's problem for (6, 4, 3), 1941).
 
     Args:
         width: number of channels of each pair.
@@ -268,7 +258,7 @@ class SetInit(Initialiser):
         given, index, starts = problem, None, self.starts
         same = repeats(problem) if self.repeats else None
         if search_follows and problem.weights.shape[1] > _ENOUGH:
-            index = _some_of(problem.usual_weights > 0, _ENOUGH)
+            index = spread_evenly(problem.usual_weights > 0, _ENOUGH)
             problem, same = _taken((problem, same), index)
         view = View(problem, self.confidence, same)
         of_pairs, of_problem = (x.to(view.there.dtype) for x in self._run(view))
@@ -314,20 +304,22 @@ class SetInit(Initialiser):
             chances, count = functional.pad(chances, (0, _MOST_JUDGES)), count + _MOST_JUDGES
         likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
-        least, samples = zip(*_samples(count, self.samples, search_follows), strict=True)
         if compiling():  # compiled code is faster with `stack`
+            least, samples = zip(*_samples(count, self.samples, search_follows), strict=True)
+            enough = torch.tensor(least, device=there.device)[:, None]
             three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
         else:
-            three = pairs[:6].index_select(1, torch.tensor(samples, device=pairs.device).mT.flatten())
-        three = three.unflatten(1, (3, len(samples))).flatten(2)  # (6, 3, S B)
+            places, enough = _sample_table(count, self.samples, search_follows, pairs.device)
+            three = pairs[:6].index_select(1, places)
+        three = three.unflatten(1, (3, -1)).flatten(2)  # (6, 3, S B)
         pose, valid = minimal_poses(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
         # In memory, the result of p3p has the dimensions: components, solutions, samples, problems.
-        each = len(samples), batch
+        each = enough.shape[0], batch
         rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
         rotation = rotation.flatten(0, 1)  # (9, H, B)
         valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
-        if least[-1]:  # padding does not count as pairs
-            valid = valid & (there.sum(1) >= torch.tensor(least, device=there.device)[:, None])
+        if not search_follows and count >= _SPREADS[0][0]:  # padding does not count as pairs
+            valid = valid & (there.sum(1) >= enough)
         valid = valid.flatten(0, 1)  # (H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
             slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT

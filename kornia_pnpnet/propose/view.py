@@ -28,9 +28,9 @@ _LEAST_CONFIDENCE = 1e-3
 class View:
     r"""The network's input.
 
-    The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll.
-    First, the camera is rotated to the mean of the rays, and zoomed so that the spread of the rays is 1. Then an affine
-    camera is fitted to the pairs by ridge regression. The world is rotated to the axes of the affine camera.
+    The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll: the
+    camera is rotated to the mean of the rays, and zoomed so that their spread is 1. The world is rotated to the axes of
+    an affine camera, which ridge regression fits to the pairs.
 
     Attributes:
         there: 1 for pairs of normal scale with a weight above 0, and 0 for other pairs, shape :math:`(B, N)`.
@@ -50,8 +50,7 @@ class View:
         plane = functional.pad(problem.img_points / problem.focal, (0, 1), value=1.0)
         self.rays = functional.normalize(plane, dim=-1)
         mean = functional.normalize((share * self.rays).sum(1), dim=-1)
-        # Two reflections rotate the mean ray to the z axis. The first reflection maps the mean ray to the negative z
-        # axis. The second reflection negates z.
+        # Two reflections rotate the mean ray to the z axis: first to the negative z axis, then z is negated.
         half = mean + eye[2]
         mirror = 1.0 - 2.0 * eye[2]
         turn = (half * mirror)[..., None] * (half / half[:, 2:])[:, None]
@@ -98,16 +97,14 @@ def repeats(problem: Problem) -> Tensor:
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:
-    """The rotation (B, 3, 3) whose first two rows are closest to the two rows of an affine camera (B, 2, 3).
-
-    ``squares`` (B, 2) are the squared lengths of the two rows. If the rows are 0, the rotation is arbitrary.
-    """
+    """The rotation (B, 3, 3) whose first two rows are closest to ``affine`` (B, 2, 3) with the lengths² ``squares``."""
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
     # The closest orthonormal rows are S^-1/2 times the rows, where S is the Gram matrix of the rows. S^-1/2 is
     # proportional to the adjugate of S + sqrt(det S) I.
     raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
-    root = (raised.prod(-1, keepdim=True) - product.square()).clamp(min=1e-12).sqrt()
+    first, second = raised.split(1, -1)  # the gradient of `prod` would wait for a GPU
+    root = (first * second - product.square()).clamp(min=1e-12).sqrt()
     diagonal = raised.flip(-1) + root
     u, v = (diagonal[..., None] * affine - product[..., None] * affine.flip(1)).unbind(1)
     eye = torch.eye(3, dtype=u.dtype, device=u.device)

@@ -19,22 +19,19 @@ def complete_noise(problem: Problem, starts: Starts) -> Noise | None:
     The result is ``None`` if neither gave noise. The sigmas are from the initialiser. If the initialiser gave no noise,
     the sigmas are from the caller, and unknown sigmas become 0. The covariances are from the caller.
     """
-    noise = starts.noise
-    if noise is None and problem.noise is not None:
-        noise = map_tensors(lambda x: x.nan_to_num(0.0), problem.noise)
-    if noise is None:
+    given = starts.noise if problem.noise is None else problem.noise
+    if given is None:
         return None
-    given = noise if problem.noise is None else problem.noise  # an initialiser estimates no covariances
+    noise = map_tensors(lambda x: x.nan_to_num(0.0), given) if starts.noise is None else starts.noise
     least = noise.img.maximum(LEAST_NOISE * problem.focal)
     return noise._replace(img=least, img_cov=given.img_cov, world_cov=given.world_cov)
 
 
 def is_known(problem: Problem) -> Tensor:
     """Find problems for which the caller gave a sigma of any pixel or world point, bool (B, 1)."""
-    known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
-    for sigma in () if problem.noise is None else problem.noise.sigmas[:2]:
-        known = known | sigma.isfinite().any(1, keepdim=True)
-    return known
+    if problem.noise is None:
+        return torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
+    return torch.stack(problem.noise[:2]).isfinite().any(-1).any(0)[:, None]
 
 
 def pixel_precision(projection: Projection, problem: Problem, noise: Noise) -> Tensor | Symmetric2:
@@ -44,41 +41,27 @@ def pixel_precision(projection: Projection, problem: Problem, noise: Noise) -> T
     return pixel_covariance(projection, problem, noise).inverse()
 
 
-def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> Tensor:
-    """Compute squared residuals with an upper bound, in variances of their pixel or, without noise, in square pixels.
-
-    Args:
-        projection: the points of the problem projected at a state.
-        problem: the problem. Its noise is known for every pair or for none.
-        most: upper bound of a squared residual in square pixels, a scalar or (B, 1). Points behind the camera have this
-            residual. With covariances the bound is multiplied by the mean precision of both coordinates.
-
-    Returns:
-        Shape :math:`(B, N)`.
-    """
-    if problem.noise is None or not problem.noise.covariances:
-        sq_residual = torch.where(projection.in_front, projection.sq_residual.minimum(most), most)
-        return sq_residual if problem.noise is None else sq_residual / pixel_variance(projection, problem.noise)
-    precision = pixel_precision(projection, problem, problem.noise)
-    assert isinstance(precision, Symmetric2)
-    most = 0.5 * most * (precision.uu + precision.vv)
-    return torch.where(projection.in_front, precision.form(*projection.residual.mT.unbind()).minimum(most), most)
-
-
 def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
-    """Compute squared residuals in the unit of the robust kernel, and the information of the pixels.
+    """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
 
-    Args:
-        projection: the points of the problem projected at a state.
-        problem: the problem, with known noise of every pair or without noise.
-
-    Returns:
-        First, squared residuals (B, N), in variances of their pixel or, without noise, in square pixels. Second, the
-        inverse variance of each pixel, (B, N) or, without noise, (B, 1). Covariances give inverse covariances instead.
+    With noise, which is then known for every pair, squared residuals are in variances of their pixel, and the
+    information is the inverse variance of each pixel, (B, N), or its inverse covariance. Without noise, squared
+    residuals are in square pixels, and the information is 1, (1, 1).
     """
-    if problem.noise is None:  # without noise, sigma is one pixel of the caller
-        return projection.sq_residual, problem.img_scale.square().reciprocal()[:, None]
+    if problem.noise is None:
+        return projection.sq_residual, problem.weights.new_ones(1, 1)
     precision = pixel_precision(projection, problem, problem.noise)
     if isinstance(precision, Tensor):
         return projection.sq_residual * precision, precision
     return precision.form(*projection.residual.mT.unbind()), precision
+
+
+def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> Tensor:
+    """Compute the squared residuals (B, N) of :func:`information` with an upper bound.
+
+    ``most`` is the bound in square pixels, a scalar or (B, 1), which becomes variances by the mean precision of both
+    coordinates. Points behind the camera have this residual.
+    """
+    sq_residual, precision = information(projection, problem)
+    most = most * (precision if isinstance(precision, Tensor) else 0.5 * (precision.uu + precision.vv))
+    return torch.where(projection.in_front, sq_residual.minimum(most), most)

@@ -2,12 +2,10 @@ r"""Robust kernels: the weight of a pair as a function of its squared residual.
 
 To add a kernel, add an entry to :data:`KERNELS`.
 
-A kernel is a loss :math:`\rho(s)` with its derivative :math:`w(s) = \rho'(s)`, where :math:`s = \|r\|^2` is the squared
-residual. Loss and derivative have one *shape* parameter. Iteratively reweighted least squares with the weight :math:`w`
-minimises :math:`\sum \rho`. The residual is in pixels of the normalised camera or, if the noise is known, in standard
-deviations. The shape of ``huber``, ``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the unit of the
-residual. The shape of ``power`` is the exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net (see
-:func:`~kornia_pnpnet.refine.residual.lm_step` for the source).
+A kernel is a loss :math:`\rho(s)` of the squared residual and its derivative :math:`w(s)`. The residual is in pixels of
+the normalised camera or, if the noise is known, in standard deviations. The *shape* of ``huber``, ``cauchy``,
+``geman_mcclure`` and ``truncated`` is a scale in the unit of the residual. The shape of ``power`` is the exponent
+:math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net.
 """
 
 from __future__ import annotations
@@ -64,15 +62,12 @@ def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:
 
 
 def _huber_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    outside = sq_residual > scale * scale
-    safe = torch.where(outside, sq_residual, 1.0)
-    return torch.where(outside, scale * safe.rsqrt(), 1.0)
+    return scale * sq_residual.maximum(scale * scale).rsqrt()
 
 
 def _huber_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    outside = sq_residual > scale * scale
-    safe = torch.where(outside, sq_residual, 1.0)
-    return torch.where(outside, 2.0 * scale * safe.sqrt() - scale * scale, sq_residual)
+    square = scale * scale
+    return sq_residual.minimum(square) + 2.0 * scale * (sq_residual.maximum(square).sqrt() - scale)
 
 
 def _cauchy_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:

@@ -11,11 +11,11 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import relative, solve_positive
-from kornia_pnpnet.core.performance import EAGER, Runner, per_problem, problems_last, repeat_problems
+from kornia_pnpnet.core.performance import EAGER, Runner, are_few, per_problem, problems_last, repeat_problems
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.belief import LEAST_PROBABILITY, believe, has_enough
-from kornia_pnpnet.judge.evidence import Evidence, Mixture, at_pose, evidence, updated, votes
+from kornia_pnpnet.judge.evidence import AtPose, Evidence, Mixture, Votes, at_pose, evidence, updated
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.refine.information import complete_noise, information, is_known, sq_standardised
 from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
@@ -43,23 +43,19 @@ _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
 
 class Plan(NamedTuple):
-    r"""The inputs of all iterations of a refinement, prepared before the first iteration.
+    r"""The inputs of all iterations of a refinement.
 
     Attributes:
-        problem: the problem in the memory layout of ``kornia_pnpnet.core.performance.problems_last``. The weights are
-            from the caller. The noise is known for every pair or ``None``.
-        prior: weight of each pair without the robust weight, for the cost and :meth:`RobustWeightedLM.judge`,
-            :math:`(B, N)`. With iterations by residual, ``prior`` is the caller's weight. Otherwise ``prior`` is the
-            product of the caller's and the initialiser's weight.
-        guided: product of the caller's and the initialiser's weight, divided by the largest product, :math:`(B, N)`.
-        by_residual: weights in the iterations by residual: the weights of the caller, divided by their mean,
-            :math:`(B, N)`. Without iterations by residual, ``by_residual`` equals ``guided``.
-        state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second state
-            of every problem, and so on.
-        known: whether the caller gave the noise of a problem, bool, :math:`(B, 1)`.
+        problem: the problem with the caller's weights. Its noise is known for every pair or ``None``.
+        prior: weight of each pair without the robust weight, for the cost and the judge, :math:`(B, N)`: the caller's
+            weight, without iterations by residual times the initialiser's weight.
+        guided: the product of both weights, divided by the largest product, :math:`(B, N)`.
+        by_residual: the caller's weights divided by their mean, :math:`(B, N)`; without iterations by residual
+            ``guided``.
+        state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second, ….
         world_sigma: the caller's standard deviation of each point, 0 where unknown, :math:`(B, N)`.
-        votes: votes of the pairs, see :func:`~kornia_pnpnet.judge.evidence.votes`, :math:`(B, N)`.
-        hyperparameters: step :math:`\gamma`, damping :math:`\lambda` and the kernel's shape of each iteration, scalars.
+        votes: votes of the pairs.
+        hyperparameters: step, damping and shape of the kernel of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
     """
 
@@ -68,25 +64,21 @@ class Plan(NamedTuple):
     guided: Tensor
     by_residual: Tensor
     state: State
-    known: Tensor
     world_sigma: Tensor
-    votes: Tensor
+    votes: Votes
     hyperparameters: tuple[tuple[Tensor, Tensor, Tensor], ...]
     starts: int
 
     def evidence_at(self, state: State) -> Evidence:
         """The evidence for the poses of a state."""
-        return evidence(at_pose(state, self.problem), self.problem, self.votes, self.known)
+        return evidence(at_pose(state, self.problem, self.votes), self.problem, self.votes)
 
 
 class Progress(NamedTuple):
-    """What one iteration passes to the next iteration.
+    """What one iteration passes to the next: the states, whether the last equations could be solved, and more.
 
-    Attributes:
-        state: the states.
-        solved: whether the last equations could be solved, bool, shape :math:`(B,)`.
-        factor: a factor of the damping, shape :math:`(B,)`.
-        mixture: the distribution of the residuals, in iterations by residual.
+    ``solved`` is bool of shape (B,). ``factor`` (B,) multiplies the damping. ``mixture`` is the distribution of the
+    residuals in iterations by residual.
     """
 
     state: State
@@ -110,8 +102,7 @@ class Refinement(NamedTuple):
         cost: robust loss of pairs and terms, divided by the number of pairs, shape :math:`(B,)`.
         ok: whether the pose is to be believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
-        probability: probability that the pose is correct, see :func:`~kornia_pnpnet.judge.belief.probability`, shape
-            :math:`(B,)`.
+        probability: see :func:`~kornia_pnpnet.judge.belief.probability`, shape :math:`(B,)`.
         sigma: :func:`~kornia_pnpnet.judge.belief.pose_sigma`, float64, shape :math:`(B,)`.
         evidence: the evidence for the pose.
     """
@@ -137,25 +128,18 @@ class RobustWeightedLM(Configured):
     Each iteration takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. The weight of a pair is the product of the
     caller's weight, the initialiser's weight, and the robust weight of the pair's residual at the previous estimate.
     Step :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``)
-    are learned. By default each iteration has its own values. The initial hyperparameters give the classical method.
+    are learned. A problem that cannot be solved keeps its pose, and is not ``ok``.
 
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
-    pixel (:func:`~kornia_pnpnet.refine.residual.pixel_variance` at the previous estimate). If the caller gave
-    covariances, residuals are whitened by the covariance of their pixel. With noise, the scale of a kernel is in
-    standard deviations, and the cost is in squared standard deviations.
+    pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is then in standard
+    deviations, and the cost in their squares.
 
-    *Several poses.* If an initialiser returns several poses, the first 70 % of the iterations (rounded down) refine all
-    poses. The remaining iterations refine only the pose of the lowest cost. For this choice, the cost uses the kernel
-    of the last iteration that refined all poses.
+    *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser, the others the
+    pose of the lowest cost, with the kernel of the last iteration that refined all poses.
 
     *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
     weights, because by then the residuals separate inliers from outliers better. In these iterations a mixture of
-    inliers and outliers, which is fitted to the residuals, replaces the kernel (see
-    :mod:`kornia_pnpnet.judge.evidence`). The variance of noise that the caller gave changes only if the residuals
-    clearly contradict it.
-
-    Problems are independent. A problem that cannot be solved keeps its pose, reports ``ok=False``, and does not change
-    other problems.
+    inliers and outliers, which is fitted to the residuals (:mod:`kornia_pnpnet.judge.evidence`), replaces the kernel.
 
     Args:
         m: number of iterations. With 0, the pose of the lowest cost is judged without refinement.
@@ -167,14 +151,13 @@ class RobustWeightedLM(Configured):
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
         reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. Without
-            rejection, iterations from a distant start can diverge. From a good start, rejection takes time but hardly
-            changes the steps.
-        by_residual: number of final iterations that ignore the initialiser's weights. This number is limited to the
-            iterations after the choice among several poses.
+            rejection, iterations from a distant start can diverge.
+        by_residual: number of final iterations that ignore the initialiser's weights, limited to the iterations after
+            the choice among several poses.
         learnable: whether the hyperparameters are trained.
-        backward: how gradients are computed. ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the
-            implicit function theorem to the last state. The memory then does not grow with ``m``. The implicit gradient
-            is exact if the iterations have converged. Step, damping and initial poses have no implicit gradient.
+        backward: ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the implicit function theorem to
+            the last state, in a memory that does not grow with ``m``. This gradient is exact if the iterations have
+            converged. Step, damping and initial poses have no implicit gradient.
 
     Raises:
         BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
@@ -227,24 +210,15 @@ class RobustWeightedLM(Configured):
         self.requires_grad_(learnable and m > 0)
 
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Step :math:`\gamma`, damping :math:`\lambda` and shape of the kernel of each iteration.
-
-        Args:
-            like: a tensor of the dtype and the device of the results.
-
-        Returns:
-            Three tensors of shape :math:`(\max(m, 1),)`.
-        """
+        r"""Step, damping and shape of the kernel of each iteration, like a tensor, :math:`(\max(m, 1),)` each."""
         count = max(self.m, 1)
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
-        """Copy the module, including its hyperparameters, with another number of iterations.
+        """Copy the module with another number of iterations.
 
-        Args:
-            m: number of iterations. A smaller number keeps the hyperparameters of the first iterations. A larger number
-                repeats the hyperparameters of the last iteration, so that poses converge further.
+        A smaller number keeps the hyperparameters of the first iterations, a larger number repeats those of the last.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
@@ -265,17 +239,15 @@ class RobustWeightedLM(Configured):
     ) -> Refinement:
         """Refine poses.
 
+        A pose is ``ok`` only if the equations of the last iteration could be solved, three pairs are in front of the
+        camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.belief.believe`).
+
         Args:
-            problem: :math:`B` problems with :math:`N` pairs each.
+            problem: the problems.
             starts: initial poses in the frame of the problem, and a weight factor for each pair.
             m: number of iterations to run; ``None``: all iterations.
             more: number of additional iterations with the hyperparameters of the last iteration.
             run: calls each part of the refinement, compiled or uncompiled.
-
-        Returns:
-            The refined poses. Weights and cost are computed at these poses with the kernel of the last iteration. A
-            pose is ``ok`` only if the equations of the last iteration could be solved and three pairs are in front of
-            the camera, and if the evidence suffices (:func:`~kornia_pnpnet.judge.belief.believe`).
         """
         plan, now = self.iterate(run(self.begin, problem, starts), m, more=more, run=run)
         return run(self.judge, plan, now)
@@ -300,13 +272,12 @@ class RobustWeightedLM(Configured):
             camera = starts.camera.repeat(len(poses), 1)
         world_sigma = torch.zeros_like(prior) if given is None else problems_last(given.world.nan_to_num(0.0))
         weights, state = (prior, guided, by_residual), State(pose, camera)
-        return Plan(problem, *weights, state, known, world_sigma, votes(problem), tuple(each), len(poses))
+        return Plan(problem, *weights, state, world_sigma, Votes.of(problem, known), tuple(each), len(poses))
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[Plan, Progress]:
         """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
 
-        See :meth:`forward` for the arguments. Returns the plan with the noise of the iterations by residual, and the
-        last states.
+        Returns the plan with the noise of the iterations by residual, and the last states. See :meth:`forward`.
         """
         m = self.m if m is None else min(m, self.m)
         each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
@@ -325,7 +296,7 @@ class RobustWeightedLM(Configured):
             if each[switch:]:
                 plan, now = run(self.shown, plan, now)
             for step, damping, _ in each[switch:]:
-                now = run(self.by_residuals, plan, now, plan.known, step, damping)
+                now = run(self.by_residuals, plan, now, plan.votes.known, step, damping)
         if self.backward == "implicit" and m and torch.is_grad_enabled():
             now = now._replace(state=self._with_gradient(plan, now, plan.hyperparameters[m - 1][2]))
         return plan, now
@@ -333,41 +304,33 @@ class RobustWeightedLM(Configured):
     def by_residuals(self, plan: Plan, now: Progress, known: Tensor, step: Tensor, damping: Tensor) -> Progress:
         r"""One iteration by residual: fit the mixture to the residuals, and take a step with its weights.
 
-        Args:
-            plan: the plan.
-            now: the states, with a mixture.
-            known: problems whose mixture keeps its variance, bool, shape :math:`(B, 1)`.
-            step: the step :math:`\gamma`, a scalar.
-            damping: the damping :math:`\lambda`, a scalar.
+        The mixture of a problem that is ``known``, bool :math:`(B, 1)`, keeps its variance.
         """
         assert now.mixture is not None
         problem = plan.problem._replace(weights=plan.by_residual)
-        step, damping = (per_problem(x, plan.prior[:, 0]) for x in (step, damping))
-        seen = at_pose(now.state, problem)
+        step, damping = (per_problem(x, problem.img_scale) for x in (step, damping))
+        seen = at_pose(now.state, problem, plan.votes)
         mixture = updated(now.mixture, seen, plan.votes, known)
-        equations = self._equations(seen.projection, problem, mixture.weights(seen) / mixture.variance, seen.precision)
+        equations = self._by_mixture(seen, problem, mixture)
         state, solved = lm_step(equations, now.state, seen.projection.focal, step, damping, additive=self.additive)
         return Progress(state, solved, now.factor, mixture)
 
     def judge(self, plan: Plan, now: Progress, found: Evidence | None = None, odds: Tensor | None = None) -> Refinement:
-        """Run everything after the last iteration: compute evidence, weights, cost and ``ok`` of a state.
+        """Run everything after :meth:`iterate`: evidence (unless ``found``), weights, cost and ``ok`` of a state.
 
-        Args:
-            plan: the plan that :meth:`iterate` returned.
-            now: the states that :meth:`iterate` returned.
-            found: the evidence for the states, if it is known already.
-            odds: log-odds of the poses against their rivals, shape :math:`(B,)`; ``None``: no rivals.
+        ``odds`` are log-odds of the poses against their rivals, shape :math:`(B,)`; ``None``: no rivals.
         """
-        seen, shape = at_pose(now.state, plan.problem), per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
+        seen = at_pose(now.state, plan.problem, plan.votes)
+        shape = per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
         if found is None:
-            found = evidence(seen, plan.problem, plan.votes, plan.known)
+            found = evidence(seen, plan.problem, plan.votes)
         if now.mixture is None:
             robust = self.kernel.weight(information(seen.projection, plan.problem)[0], shape)
         else:
             robust = found.mixture.weights(seen)
         weights = torch.where(seen.projection.in_front, plan.prior * robust, 0.0)
         cost = self._cost(seen.projection, plan.problem, plan.prior, shape)
-        probability, ok, sigma = believe(seen, plan.problem, found, plan.known)
+        probability, ok, sigma = believe(seen, plan.problem, found, plan.votes.known)
         if odds is not None:
             probability = probability * odds.sigmoid()
             ok = ok & (probability >= LEAST_PROBABILITY)
@@ -375,20 +338,16 @@ class RobustWeightedLM(Configured):
         return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
-        """Fit a mixture to the residuals, and let them choose the noise that an initialiser estimated.
-
-        The noise of the points adds to the noise of the pixels at small depths. If the residuals are likelier without
-        noise of the points, the estimated noise of the points becomes 0. Noise from the caller does not change.
-        """
+        """Fit a mixture to the residuals. If they are likelier without estimated noise of points, it becomes 0."""
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
         of_pixels = noise._replace(world=plan.world_sigma)
         both = map_tensors(lambda x, y: torch.cat((x.mT, y.mT), 1).mT, noise, of_pixels)
-        state, problem, votes, known = repeat_problems((now.state, problem, plan.votes, plan.known), 2)
+        state, problem, votes = repeat_problems((now.state, problem, plan.votes), 2)
         problem = problem._replace(noise=both)
-        found = evidence(at_pose(state, problem), problem, votes, known)
-        batch = plan.votes.shape[0]
+        found = evidence(at_pose(state, problem, votes), problem, votes)
+        batch = plan.prior.shape[0]
         first, second = found.likelihood.view(2, batch)
         other = (second > first + _EXPECTED).long()
         index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
@@ -397,11 +356,10 @@ class RobustWeightedLM(Configured):
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
         """One iteration. With ``reject_worse``, a problem whose cost would rise keeps its state."""
-        step, damping = (per_problem(x, problem.weights[:, 0]) for x in (step, damping))
+        step, damping = (per_problem(x, problem.img_scale) for x in (step, damping))
         shape = per_problem(shape, problem.weights[:, :1])
         damping = damping * now.factor if self.reject_worse else damping
-        projection = project(now.state, problem)
-        equations = self._equations(projection, problem, *self._robust(projection, problem, shape))
+        projection, equations = self._by_kernel(now.state, problem, shape)
         state, solved = lm_step(equations, now.state, projection.focal, step, damping, additive=self.additive)
         if not self.reject_worse:
             return Progress(state, solved, now.factor)
@@ -415,10 +373,18 @@ class RobustWeightedLM(Configured):
         kept = map_tensors(lambda x, y: torch.where(better.view(-1, *(1,) * (x.ndim - 1)), x, y), state, now.state)
         return Progress(kept, solved, factor)
 
-    def _robust(self, projection: Projection, problem: Problem, shape: Tensor) -> tuple[Tensor, Tensor | Symmetric2]:
-        """Robust weights (B, N) of the kernel, and the information of the pixels."""
+    def _by_kernel(self, state: State, problem: Problem, shape: Tensor) -> tuple[Projection, NormalEquations]:
+        """The normal equations with the weights of the kernel."""
+        projection = project(state, problem)
         sq_residual, precision = information(projection, problem)
-        return self.kernel.weight(sq_residual, shape), precision
+        robust = self.kernel.weight(sq_residual, shape)
+        if problem.noise is None and problem.terms:  # without noise, sigma is one pixel of the caller
+            robust = robust / problem.img_scale.square()[:, None]
+        return projection, self._equations(projection, problem, robust, precision)
+
+    def _by_mixture(self, seen: AtPose, problem: Problem, mixture: Mixture) -> NormalEquations:
+        """The normal equations with the weights of the mixture."""
+        return self._equations(seen.projection, problem, mixture.weights(seen) / mixture.variance, seen.precision)
 
     def _equations(
         self, projection: Projection, problem: Problem, robust: Tensor, precision: Tensor | Symmetric2
@@ -453,24 +419,19 @@ class RobustWeightedLM(Configured):
     def _with_gradient(self, plan: Plan, now: Progress, shape: Tensor) -> State:
         r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
 
-        Let :math:`g(\delta) = J^\top W r` at the state moved by :math:`\delta`. At the minimum :math:`g = 0`, so that
-        :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`. The code adds a Newton step that has this gradient
-        and the value 0. If the Newton matrix is not positive definite, the state is not a minimum yet. The Gauss-Newton
-        matrix is then used. A second step with the same matrix makes second derivatives exact. Covariances rotate with
-        the pose, so that the matrix is not exactly symmetric. With covariances, a third step therefore removes most of
-        the error.
+        At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
+        The code adds a Newton step that has this gradient and the value 0, with the Gauss-Newton matrix if the Newton
+        matrix is not positive definite. A second step makes second derivatives exact. Covariances rotate with the pose,
+        so that the matrix is not exactly symmetric: a third step then removes most of the error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
             if mixture is None:
-                projection = project(at, problem)
-                return self._equations(projection, problem, *self._robust(projection, problem, shape))
-            seen = at_pose(at, problem)
-            return self._equations(seen.projection, problem, mixture.weights(seen) / mixture.variance, seen.precision)
+                return self._by_kernel(at, problem, shape)[1]
+            return self._by_mixture(at_pose(at, problem, plan.votes), problem, mixture)
 
         mixture, state = now.mixture, now.state
-        weights = plan.guided if mixture is None else plan.by_residual
-        problem = plan.problem._replace(weights=weights)
+        problem = plan.problem._replace(weights=plan.guided if mixture is None else plan.by_residual)
         zero = torch.zeros_like(state.pose.translation[:1, 0]).expand(6 + state.camera.shape[1], state.camera.shape[0])
         zero = zero.clone().requires_grad_()
         with torch.enable_grad():
@@ -491,7 +452,9 @@ def taken(tree: _T, index: Tensor) -> _T:
     """Select problems from every tensor of a tree except scalars, in the memory layout of ``problems_last``."""
 
     def select(x: Tensor) -> Tensor:
-        return x.movedim(0, -1).index_select(-1, index).movedim(-1, 0) if x.ndim else x
+        if not x.ndim or are_few(x):
+            return x[index] if x.ndim else x
+        return x.movedim(0, -1).index_select(-1, index).movedim(-1, 0)
 
     return map_tensors(select, tree)
 

@@ -4,10 +4,9 @@ The pose maps points by ``x_cam = R x_world + t``. The camera looks along +z. Pi
 focal length and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its
 distance. The test does not depend on the unit of the world.
 
-The dimensions of arrays in this module are coordinates, pairs and problems, in this order. An operation then runs over
-long rows of memory, even if each problem has few pairs. Kornia's ``transform_points`` and ``project_points`` compute
-the same projection (``tests/test_kornia_contract.py``), but neither residual nor Jacobian. For 1000 problems of 9
-pairs, these batch-first functions take three times as long as this module.
+The dimensions of arrays in this module are coordinates, pairs and problems, in this order, so that operations run over
+long rows of memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection
+(``tests/test_kornia_contract.py``), but take three times as long for 1000 problems of 9 pairs.
 """
 
 from __future__ import annotations
@@ -19,8 +18,9 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from kornia.geometry.liegroup import So3
 from torch import Tensor
+from torch.nn import functional
 
-from kornia_pnpnet.core.linalg import dot, solve_positive
+from kornia_pnpnet.core.linalg import dot, small_product, solve_positive
 from kornia_pnpnet.core.performance import are_few, compiling
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
@@ -56,8 +56,7 @@ class Projection(NamedTuple):
     r"""Points projected at a state, and their residuals. The problems are the last dimension.
 
     Attributes:
-        residual: projection minus measurement in pixels, shape :math:`(2, N, B)`. If ``front`` is false, the residual
-            is finite but meaningless.
+        residual: projection minus measurement in pixels, finite but meaningless behind the camera, :math:`(2, N, B)`.
         front: whether the point is in front of the camera, bool, shape :math:`(N, B)`.
         rotated: the rotated points before translation, :math:`y = R x`, shape :math:`(3, N, B)`.
         plane: :math:`(p, q) = (x/z, y/z)`, 0 for points behind the camera, shape :math:`(2, N, B)`.
@@ -67,8 +66,7 @@ class Projection(NamedTuple):
         state: the state.
         stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
             ``None``: there is no distortion.
-        slope: twice the derivative of :math:`d` with respect to :math:`\rho^2`, shape :math:`(N, B)`; ``None``: there
-            is no distortion.
+        slope: twice the derivative of :math:`d` by :math:`\rho^2`, shape :math:`(N, B)`; or ``None``.
     """
 
     residual: Tensor
@@ -108,32 +106,25 @@ class NormalEquations(NamedTuple):
 
 
 def project(state: State, problem: Problem) -> Projection:
-    """Project the points of a problem, and subtract their pixels.
+    """Project the points of a problem, and subtract their pixels: the residual is :math:`f d (p, q) - b`.
 
     The depth of points behind the camera is replaced *before* the division, so that neither values nor gradients can
     overflow.
-
-    Args:
-        state: poses in the frame of the problem, and the unknown parameters of the cameras.
-        problem: the problem.
-
-    Returns:
-        The :class:`Projection`. The residual is :math:`f d (p, q) - b`, where :math:`b` is the pixel.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[1.0, 2.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
         >>> project(State.of(Pose(torch.eye(3)[None], torch.zeros(1, 3))), problem).residual.flatten()
         tensor([25., 50.])
     """
-    a, b, c = problem.world_points.permute(2, 1, 0).unbind()  # (N, B) each
-    i, j, k = state.pose.rotation.permute(2, 1, 0)[:, :, None].unbind()  # columns, (3, 1, B) each
-    rotated = torch.addcmul(torch.addcmul(i * a, j, b), k, c)  # (3, N, B)
+    rotation, world = state.pose.rotation, problem.world_points
+    if are_few(world):  # one call
+        rotated = torch.bmm(rotation, world.mT).permute(1, 2, 0)
+    else:
+        rotated = small_product(rotation.permute(1, 2, 0), world.permute(2, 1, 0))  # (3, N, B)
     points = rotated + state.pose.translation.mT[:, None]
     if problem.rig is not None:
-        i, j, k = problem.rig.rotation.permute(3, 2, 1, 0).unbind()  # columns, (3, N, B) each
-        x, y, z = points.unbind()
-        shift = problem.rig.translation.permute(2, 1, 0)
-        points = torch.addcmul(torch.addcmul(torch.addcmul(shift, i, x), j, y), k, z)
+        turned = (problem.rig.rotation.permute(2, 3, 1, 0) * points).sum(1)
+        points = turned + problem.rig.translation.permute(2, 1, 0)
     x, y, z = points.unbind()
     least_slope = MIN_DEPTH_RATIO / math.sqrt(1.0 - MIN_DEPTH_RATIO**2)
     smallest = torch.finfo(z.dtype).tiny ** 0.5  # keeps the square of the inverse depth finite
@@ -148,9 +139,9 @@ def project(state: State, problem: Problem) -> Projection:
         return Projection(scaled * inv_depth, front, rotated, plane, inv_depth, scaled, focal, state)
     square = plane.square().sum(0)
     stretch, slope = torch.ones_like(square), torch.zeros_like(square)
-    for power, coefficient in enumerate(state.radial.unbind(1)):
-        stretch = stretch + coefficient * square ** (power + 1)
-        slope = slope + 2.0 * (power + 1) * coefficient * square**power
+    for power, coefficient in enumerate(state.radial.unbind(1), 1):
+        stretch = stretch + coefficient * square**power
+        slope = slope + 2.0 * power * coefficient * square ** (power - 1)
     residual = focal * stretch * plane - img
     scaled = residual * torch.where(front, z, 1.0)
     return Projection(residual, front, rotated, plane, inv_depth, scaled, focal, state, stretch, slope)
@@ -164,12 +155,7 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
     :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2` with
     :math:`\mathrm{tr}(J J^\top) = (f/z)^2 (2 + p^2 + q^2)`.
 
-    Args:
-        projection: the result of :func:`project`.
-        noise: standard deviations.
-
-    Returns:
-        The mean variance, shape :math:`(B, N)`. A point behind the camera has only the noise of its pixel.
+    The result has the shape :math:`(B, N)`. A point behind the camera has only the noise of its pixel.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[0.0, 0.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -186,7 +172,8 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
 def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
     """Covariance of each pixel, entries (B, N). A point behind the camera has only the noise of its pixel."""
     rotation = projection.state.pose.rotation[:, None]
-    rotation = rotation if problem.rig is None else problem.rig.rotation @ rotation
+    if problem.rig is not None:
+        rotation = problem.rig.rotation @ rotation
     p, q = (x.mT for x in projection.plane.unbind())
     return covariance_at(rotation, p, q, (projection.focal * projection.inv_depth).mT, noise)
 
@@ -199,8 +186,8 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
 
     Args:
         rotation: rotation from the world to the camera, :math:`(*, 1, 3, 3)` or :math:`(*, N, 3, 3)`.
-        p: horizontal coordinate :math:`x/z`, shape :math:`(*, N)`.
-        q: vertical coordinate :math:`y/z`, shape :math:`(*, N)`.
+        p: :math:`x/z`, shape :math:`(*, N)`.
+        q: :math:`y/z`, shape :math:`(*, N)`.
         scale: focal length over depth, shape :math:`(*, N)`.
         noise: noise of each pair.
     """
@@ -224,16 +211,12 @@ def normal_equations(
     """Build the normal equations of the residuals for the pose and the unknown parameters of the camera.
 
     Args:
-        projection: the result of :func:`project`.
-        problem: the problem that was projected.
-        weights: weight of each pair, :math:`(B, N)`, or 2x2 weight matrix of each pair with entries :math:`(B, N)`.
-            Points behind the camera do not count.
+        projection: the problem projected at the state.
+        problem: the problem.
+        weights: weight of each pair, :math:`(B, N)`, or 2x2 weight matrix of each pair with entries :math:`(B, N)`, in
+            inverse square pixels. Points behind the camera do not count.
         relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
             underflow. The divisor has no gradient.
-
-    Returns:
-        The normal equations for a tangent vector of :func:`moved`. :math:`J` is divided by the focal length, and
-        :math:`r` is in pixels.
     """
     unit, sq_inverse = None, projection.inv_depth * projection.inv_depth
     if relative:
@@ -246,38 +229,35 @@ def normal_equations(
 
 
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
-    r"""The rows of the Jacobian for u and v, times :math:`z / f`, shape :math:`(6 + K, 2, N, B)`.
+    """The rows of the Jacobian for u and v, times z/f, shape (6 + K, 2, N, B).
 
-    Let :math:`y = R x`. Let :math:`e` be a row of :math:`z` times the derivative of :math:`(p, q)` with respect to a
-    point in the frame of the pose. The entries of a row of the Jacobian are :math:`y \times e` for the rotation and
-    :math:`e` for the translation. For one camera the rows :math:`e` are :math:`(1, 0, -p)` and :math:`(0, 1, -q)`.
+    A row is y × e for the rotation and e for the translation, where y = R x, and e is z times the derivative of p or q
+    by a point in the frame of the pose. For one camera the rows e are (1, 0, -p) and (0, 1, -q).
     """
-    plane, y3 = projection.plane, projection.rotated[2]
+    plane = projection.plane
     if problem.rig is None:
-        ones = torch.eye(2, dtype=plane.dtype, device=plane.device)[..., None, None].expand(2, *plane.shape)
-        shifts = torch.cat((ones, -plane[None]))
+        axes = torch.eye(3, dtype=plane.dtype, device=plane.device)[..., None, None]
     else:
         axes = problem.rig.rotation.permute(3, 2, 1, 0)
-        shifts = torch.addcmul(axes[:, :2], plane, axes[:, 2:], value=-1)
+    shifts = torch.addcmul(axes[:, :2], plane, axes[:, 2:], value=-1)
     jacobian = torch.cat((torch.linalg.cross(projection.rotated[:, None], shifts, dim=0), shifts))
     unknown = projection.state.camera.shape[1]
     if not unknown:
         return jacobian
-    if projection.stretch is None or projection.slope is None:
-        zoomed, powers = y3, []  # the depth of the origin grows with f, see `moved`
-    else:
+    moved_by = y3 = projection.rotated[2:]  # the depth of the origin grows with f, see `moved`
+    if projection.stretch is not None and projection.slope is not None:
         # The Jacobian of the distortion is d I + slope (p, q) (p, q)^T.
         along = projection.slope * (plane * jacobian).sum(1, keepdim=True)
         jacobian = projection.stretch * jacobian + along * plane
-        depth = torch.where(projection.front, projection.inv_depth, 1.0).reciprocal()
+        depth = torch.where(projection.front, y3[0] + projection.state.pose.translation[:, 2], 1.0)
         square = plane.square().sum(0)
         zoomed = projection.stretch * y3 - projection.slope * square * (depth - y3)
-        powers = [depth * square ** (power + 1) for power in range(unknown - 1)]
-    return torch.cat((jacobian, plane * torch.stack((zoomed, *powers))[:, None]))
+        moved_by = torch.cat((zoomed, *((depth * square**power)[None] for power in range(1, unknown))))
+    return torch.cat((jacobian, plane * moved_by[:, None]))
 
 
 def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
-    """Build the normal equations by one product of all columns. The low number of calls is faster for few pairs."""
+    """Build the normal equations by one product of all columns, for few pairs."""
     jacobian = _jacobian(projection, problem)
     if isinstance(weights, Tensor):
         weighted = jacobian * weights
@@ -317,8 +297,8 @@ def _entrywise_equations(
         for j in size[: i + 1]
     }
     matrix = torch.stack([lower[max(i, j), min(i, j)] for i in size for j in size]).unflatten(0, (len(size), len(size)))
-    scaled = (projection.scaled[0], projection.scaled[1])
-    return matrix, torch.stack([inner(column, scaled) for column in weighted])
+    u, v = projection.scaled
+    return matrix, torch.stack([inner(column, (u, v)) for column in weighted])
 
 
 def _columns(projection: Projection, problem: Problem) -> list[_Column]:
@@ -328,13 +308,15 @@ def _columns(projection: Projection, problem: Problem) -> list[_Column]:
     y1, y2, y3 = projection.rotated.unbind()
     p, q = projection.plane.unbind()
     minus_p, minus_q = (-projection.plane).unbind()
-    turns: list[_Column] = [
+    pose: list[_Column] = [
         (minus_p * y2, torch.addcmul(-y3, minus_q, y2)),
         (torch.addcmul(y3, p, y1), q * y1),
         (-y2, y1),
+        (1.0, 0.0),
+        (0.0, 1.0),
+        (minus_p, minus_q),
     ]
-    shifts: list[_Column] = [(1.0, 0.0), (0.0, 1.0), (minus_p, minus_q)]
-    return [*turns, *shifts, (p * y3, q * y3)] if projection.state.camera.shape[1] else [*turns, *shifts]
+    return [*pose, (p * y3, q * y3)] if projection.state.camera.shape[1] else pose
 
 
 def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
@@ -363,29 +345,25 @@ def lm_step(
 
     .. math:: \beta \leftarrow \beta - \gamma\,(J^\top W J + \lambda\,\mathrm{diag}(J^\top W J))^{-1} J^\top W r
 
-    The residual :math:`r` of the state :math:`\beta` is projection minus measurement, hence the minus sign. A common
-    factor of the weights does not change the step.
-
     Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, section 3. D. Marquardt
     (1963) proposed the damping by the diagonal.
 
     Args:
         equations: the normal equations at the state.
-        state: the state to improve.
+        state: the state :math:`\beta`.
         focal: the focal length in pixels, a scalar or of shape :math:`(B,)`.
         step: :math:`\gamma`, a scalar.
         damping: :math:`\lambda`, a scalar or of shape :math:`(B,)`.
         additive: update the rotation vector additively as in the paper, instead of by the retraction.
 
     Returns:
-        The moved state, and whether the equations could be solved, bool, shape :math:`(B,)`. A state whose equations
-        could not be solved does not change.
+        The moved state, and whether the equations could be solved, bool, shape :math:`(B,)`. Otherwise the state does
+        not change.
     """
     if not additive:
         delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
         return moved(state, delta * (-step / focal)), solved
-    # Write the equations in terms of the rotation vector. The derivative of the tangent vector with respect to the
-    # rotation vector is the left Jacobian of SO(3).
+    # The derivative of the tangent vector with respect to the rotation vector is the left Jacobian of SO(3).
     rvec = rotation_matrix_to_axis_angle(state.pose.rotation)
     size, matrix = len(equations.gradient), equations.matrix.permute(2, 0, 1)
     tangent = torch.eye(size, dtype=rvec.dtype, device=rvec.device).repeat(rvec.shape[0], 1, 1)
@@ -400,49 +378,43 @@ def lm_step(
 def moved(state: State, delta: Tensor) -> State:
     r"""Move a state along a tangent vector :math:`(\omega, v, c)`, shape :math:`(6 + K, B)`.
 
-    The pose becomes :math:`(\mathrm{cay}(\omega) R,\; t + v)`. Rotation and translation move independently. With a
-    centred world, a rotation therefore leaves the centroid in place. Rotation and translation then stay well separated
-    in the normal equations at any distance of the points.
+    The pose becomes :math:`(\mathrm{cay}(\omega) R,\; t + v)`. With a centred world, a rotation leaves the centroid in
+    place, so that rotation and translation stay well separated in the normal equations at any distance of the points.
 
-    The Cayley transform is
-    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)`. The transform agrees
-    with the exponential map to second order. The angle of rotation is :math:`2 \arctan(|\omega|/2)`, at most half a
-    turn. The transform needs neither trigonometry nor a branch at 0.
+    The Cayley transform
+    :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)` agrees with the
+    exponential map to second order, and needs neither trigonometry nor a branch at 0. The angle of rotation is
+    :math:`2 \arctan(|\omega|/2)`.
 
     The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
-    zoom. The origin, which is the centroid of a centred world, then keeps its pixel and its scale. Without this motion,
-    a larger focal length and a smaller distance of the camera would move the pixels of distant points in the same way.
+    zoom, so that the origin keeps its pixel and its scale. Otherwise a larger focal length and a smaller distance of
+    the camera would move the pixels of distant points in the same way.
     """
-    half, rotation = 0.5 * delta[:3], state.pose.rotation.permute(1, 2, 0)
-    factor = 2.0 / (1.0 + half.square().sum(0))
+    turn, rotation = delta[:3, None], state.pose.rotation.permute(1, 2, 0)
+    size = turn.square().sum(0) + 4.0
     if not compiling():
-        once = torch.linalg.cross(half[:, None], rotation, dim=0)
-        rotation = torch.addcmul(rotation, factor, once + torch.linalg.cross(half[:, None], once, dim=0))
+        once = torch.linalg.cross(turn, rotation, dim=0)
+        both = torch.add(once, torch.linalg.cross(turn, once, dim=0), alpha=0.5)
+        rotation = torch.addcdiv(rotation, both, size, value=4.0)
     else:  # entry by entry: compiled `linalg.cross` computes the vector and the factor again for each entry
-        once = [_cross([*half], [*column]) for column in rotation.unbind(1)]
-        twice = [_cross([*half], column) for column in once]
-        turned = [[x + y for x, y in zip(*both, strict=True)] for both in zip(once, twice, strict=True)]
-        rotation = torch.addcmul(rotation, factor, torch.stack([torch.stack(x) for x in turned], 1))
+        columns = [_cross([*turn[:, 0]], [*column]) for column in rotation.unbind(1)]
+        twice = [_cross([*turn[:, 0]], column) for column in columns]
+        sums = [[x + 0.5 * y for x, y in zip(*pair, strict=True)] for pair in zip(columns, twice, strict=True)]
+        rotation = torch.addcmul(rotation, 4.0 / size, torch.stack([torch.stack(x) for x in sums], 1))
     rotation = rotation.permute(2, 0, 1)
     translation = state.pose.translation + delta[3:6].mT
     if not state.camera.shape[1]:
         return State(Pose(rotation, translation), state.camera)
     zoom = delta[6:7].clamp(-_LARGEST_ZOOM, _LARGEST_ZOOM)
-    change = torch.cat((zoom, delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)))
-    x, y, z = translation.unbind(-1)
-    translation = torch.stack((x, y, z * zoom[0].exp())).mT
+    change = zoom
+    if state.camera.shape[1] > 1:
+        change = torch.cat((zoom, delta[7:].clamp(-_LARGEST_RADIAL, _LARGEST_RADIAL)))
+    translation = translation * functional.pad(zoom.mT.exp(), (2, 0), value=1.0)
     return State(Pose(rotation, translation), state.camera + change.mT)
 
 
 def retract(pose: Pose, delta: Tensor) -> Pose:
-    r"""Move a pose of a known camera by :func:`moved`.
-
-    Args:
-        pose: rotation :math:`(B, 3, 3)`, translation :math:`(B, 3)`.
-        delta: :math:`(\omega, v)`, radians and world units, shape :math:`(B, 6)`.
-
-    Returns:
-        The moved pose.
+    r"""Move a pose of a known camera by :func:`moved`, along :math:`(\omega, v)` of shape :math:`(B, 6)`.
 
     Example:
         >>> pose = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -456,9 +428,8 @@ def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
     r"""Angle between two rotations.
 
     With :math:`D = A B^\top`, the angle is
-    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))`. The equivalent formula
-    :math:`\arccos((\mathrm{tr} D - 1)/2)` loses half of its digits for small angles. The angle is not differentiable at
-    0. Use the losses of :mod:`kornia_pnpnet.losses` for training.
+    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))`, accurate for
+    small angles, unlike the arccosine. The angle is not differentiable at 0: train with :mod:`kornia_pnpnet.losses`.
 
     Args:
         rotation_a: :math:`A`, shape :math:`(*, 3, 3)`.

@@ -9,13 +9,12 @@ import math
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK, KORNIA_CHECK_SHAPE
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_pnpnet.core.checks import check_shapes
-from kornia_pnpnet.core.performance import compiling
+from kornia_pnpnet.core.checks import Shapes, check_devices, check_form, check_positive, check_shapes, common_dtype
+from kornia_pnpnet.core.performance import compiling, full_precision
 from kornia_pnpnet.problem import Linear, State
 from kornia_pnpnet.refine.residual import NormalEquations
 from kornia_pnpnet.result import Pose, PosePrior
@@ -35,26 +34,23 @@ _RADIAL = 0.15
 _MOST_MATRICES = 10_000
 
 
+@full_precision
 def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
     """Make a prior from a measured direction of gravity, for example from an accelerometer.
 
-    The prior says nothing about heading and position.
+    The prior says nothing about heading and position. The rotation of its pose turns ``world_down`` to ``cam_down``
+    with an arbitrary heading. Gradients flow to all arguments.
 
     Args:
         world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`; :math:`B` stands
             for any number of leading dimensions, also for none.
-        cam_down: measured direction of gravity in the camera's axes (+z forward), of any non-zero length, shape
-            :math:`(B, 3)`.
-        sigma: standard deviation of the measured direction in radians, a number or :math:`(B,)`. The errors about both
-            axes perpendicular to the direction have this standard deviation.
-
-    Returns:
-        The prior. The rotation of its pose turns ``world_down`` to ``cam_down``. The heading of this rotation is
-        arbitrary. Gradients flow to the directions and to sigma.
+        cam_down: measured direction of gravity in the camera's axes (+z forward), as ``world_down``.
+        sigma: standard deviation of the measured direction about each perpendicular axis in radians, a number or
+            :math:`(B,)`.
 
     Raises:
-        ShapeError: when the directions are not :math:`(B, 3)`.
-        BaseError: when sigma is a number that is not positive.
+        BaseError: when the directions are not :math:`(B, 3)`, or sigma is neither a positive number nor a tensor with
+            the shape above.
 
     Example:
         >>> down = torch.tensor([[0.0, 0.0, -1.0]])  # the world's z axis points up
@@ -62,14 +58,22 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
         >>> prior.information.diagonal(dim1=1, dim2=2).round()
         tensor([[10000.,     0., 10000.,     0.,     0.,     0.]])
     """
-    KORNIA_CHECK_SHAPE(world_down, ["*", "3"])
-    check_shapes({"cam_down": (cam_down, tuple(world_down.shape))})
-    KORNIA_CHECK(isinstance(sigma, Tensor) or sigma > 0, f"sigma must be positive, got {sigma}.")
-    a, b = (functional.normalize(x, dim=-1) for x in (world_down, cam_down))
+    check_form(["*", "3"], world_down=world_down)
+    tensors = {"world_down": world_down, "cam_down": cam_down}
+    shapes: Shapes = {"cam_down": (cam_down, tuple(world_down.shape))}
+    if isinstance(sigma, Tensor):
+        tensors["sigma"], shapes["sigma"] = sigma, (sigma, tuple(world_down.shape[:-1]) if sigma.ndim else ())
+    else:
+        check_positive(or_infinite=True, sigma=sigma)
+    check_shapes(shapes)
+    check_devices(tensors, world_down, "world_down")
+    dtype = common_dtype(tensors)
+    a, b = (functional.normalize(x.to(dtype), dim=-1) for x in (world_down, cam_down))
     eye = torch.eye(3, dtype=b.dtype, device=b.device)
     # The rotation is half a turn about the bisector of both directions. Opposite directions have no bisector. Any
     # perpendicular axis is used instead.
-    across = torch.linalg.cross(a, eye[a.detach().abs().argmin(-1)])
+    least = a.detach().abs().argmin(-1, keepdim=True)
+    across = torch.linalg.cross(a, torch.zeros_like(a).scatter(-1, least, 1.0))
     opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
     middle = functional.normalize(torch.where(opposite, across, a + b), dim=-1)
     rotation = 2.0 * middle[..., :, None] * middle[..., None, :] - eye
@@ -80,13 +84,7 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
 
 
 def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> NormalEquations:
-    r"""Add a term to the normal equations of the pairs.
-
-    Args:
-        equations: the normal equations of the pairs at a state, with weights in inverse square pixels.
-        linear: the term, linearised at the same state.
-        focal: the focal length in pixels, a scalar or (B,).
-    """
+    """Add a term to the normal equations of the pairs at the same state. The focal length is a scalar or (B,)."""
     weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
     weight = linear.weight / (focal if equations.unit is None else equations.unit[:, 0] * focal)
     matrix = torch.bmm(weighted, linear.jacobian).permute(1, 2, 0) * (weight / focal)
@@ -101,8 +99,7 @@ class CameraTerm(NamedTuple):
         expected: the focal length that the caller expects, in pixels, shape :math:`(B,)`.
         information: inverse variance of the logarithm of the focal length, shape :math:`(B,)`; ``None``: there is no
             prior of the camera.
-        width: half the width of the interval in which the logarithm of the focal length is searched, shape
-            :math:`(B,)`. The centre of the interval is the logarithm of ``focal``.
+        width: half the width of the interval around the logarithm of ``focal`` that is searched, shape :math:`(B,)`.
         focal: the focal length of the problem in pixels, shape :math:`(B,)`.
     """
 
@@ -112,11 +109,11 @@ class CameraTerm(NamedTuple):
     focal: Tensor
 
     def scaled(self, pixels: Tensor) -> CameraTerm:
-        """Convert the focal lengths to other pixels. ``pixels`` is the number of new pixels per old pixel, (B,)."""
+        """Convert the focal lengths to other pixels, given the number (B,) of new pixels per old pixel."""
         return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
 
     def linearise(self, state: State) -> Linear:
-        """Linearise the term. The residual is log f minus its expected value, then the coefficients of distortion."""
+        """The residual is log f minus its expected value, then the coefficients of distortion."""
         assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
@@ -143,8 +140,7 @@ class PoseTerm(NamedTuple):
         information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
         offset: the point of the caller's world that is the origin of the problem, in lengths of the problem, shape
             :math:`(B, 3)`. Errors of the translation are measured at the origin of the caller's world.
-        free: axis in the camera about which the rotation is unknown, 0 unless exactly one such axis exists, shape
-            :math:`(B, 3)`.
+        free: the only axis in the camera about which the rotation is unknown, or 0, shape :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
         rank: number of directions in which the prior has information, shape :math:`(B,)`.
     """
@@ -158,16 +154,9 @@ class PoseTerm(NamedTuple):
 
     @classmethod
     def of(cls, prior: PosePrior, centroid: Tensor, size: Tensor) -> tuple[PoseTerm, Tensor]:
-        """Express a prior in the frame of a problem.
+        """Express a prior in the frame of a problem, with the ``centroid`` and ``size`` of its ``Frame``.
 
-        Args:
-            prior: the prior in the world of the caller.
-            centroid: the world point that became the origin, (B, 3).
-            size: the length in the caller's world that became 1, (B,).
-
-        Returns:
-            First, the term. Second, whether the prior is usable (see ``_is_usable``), bool (B,). The information of an
-            unusable prior becomes 0.
+        Also returns whether the prior is usable, bool (B,). The information of an unusable prior becomes 0.
         """
         lengths = torch.cat((torch.ones_like(centroid), size[:, None].expand(-1, 3)), -1)
         usable = _is_usable(prior, lengths)
@@ -185,22 +174,10 @@ class PoseTerm(NamedTuple):
             Pose(rotation, moved), information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank
         ), usable
 
-    def recentred(self, centre: Tensor) -> PoseTerm:
-        """The term in a world whose origin is the world point ``centre``, (B, 3)."""
-        rotation, translation = self.pose
-        pose = Pose(rotation, translation + (rotation @ centre[..., None])[..., 0])
-        return self._replace(pose=pose, offset=self.offset + centre)
-
     def errors(self, pose: Pose) -> tuple[Tensor, Tensor]:
-        r"""The tangent vector from poses to the prior's pose, and its squared Mahalanobis length.
+        """The tangent vector of ``retract`` from poses to the prior's pose, (B, 6), and its squared Mahalanobis length.
 
-        Args:
-            pose: poses, :math:`(B, 3, 3)` and :math:`(B, 3)`.
-
-        Returns:
-            First, the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`. The
-            vector has the shape :math:`(B, 6)` and contains no rotation about ``free``. Second, the squared
-            Mahalanobis length of the vector, :math:`(B,)`.
+        The vector contains no rotation about ``free``.
         """
         turn = self.pose.rotation @ pose.rotation.mT
         # Rotate the prior's pose about the free axis until it is as close as possible to the given pose.
@@ -251,10 +228,7 @@ class PoseTerm(NamedTuple):
 
 
 def _is_usable(prior: PosePrior, lengths: Tensor) -> Tensor:
-    """Whether numbers are bounded, the scale is positive, and the information is positive semi-definite, bool (B,).
-
-    The entries of ``lengths`` (B, 6) are units of a tangent vector.
-    """
+    """Whether numbers are bounded, the scale is positive, and the information is positive semi-definite, bool (B,)."""
     information = prior.information * lengths[:, :, None] * lengths[:, None]
     numbers = [prior.pose.rotation, prior.pose.translation / lengths[:, 3:], information]
     limit = torch.finfo(prior.information.dtype).max ** 0.25

@@ -52,9 +52,6 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
         folder: folder of the weights.
         results: results of the run that trained the weights.
         name: name of the weights; the name of the run when ``None``.
-
-    Raises:
-        OSError: when the file cannot be written.
     """
     from huggingface_hub import EvalResult, ModelCardData
 

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,22 +42,16 @@ def stop_on_signal() -> Iterator[threading.Event]:
     Only the main thread can catch signals. In other threads the event is never set.
     """
     event = threading.Event()
-    before: dict[int, Any] = {}
+    with ExitStack() as handlers:
 
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        def stop(*_: object) -> None:
+            event.set()
+            handlers.close()  # restores the earlier handlers: a second signal ends the process as usual
 
-    def stop(*_: object) -> None:
-        event.set()
-        restore()  # a second signal ends the process as usual
-
-    if threading.current_thread() is threading.main_thread():
-        before |= {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                handlers.callback(signal.signal, number, signal.signal(number, stop))
         yield event
-    finally:
-        restore()
 
 
 class StageClock:
@@ -77,7 +71,7 @@ class StageClock:
 def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
     """Write a CSV file atomically. Missing values become empty cells."""
     with atomic_open(path, newline="") as file:
-        writer = csv.DictWriter(file, list(columns), restval="", extrasaction="ignore")
+        writer = csv.DictWriter(file, list(columns), extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
 
@@ -90,18 +84,16 @@ class History:
         self._columns = columns
         rows: list[dict[str, Any]] = []
         if start and self._path.is_file():
-            with self._path.open(newline="") as file:
-                rows = [row for row in csv.DictReader(file) if None not in row.values()]  # a crash can cut the last row
-            rows = [row for row in rows if row["update"].isdigit() and int(row["update"]) <= start]
+            with self._path.open(newline="") as file:  # a crash can cut the last row
+                rows = [row for row in csv.DictReader(file) if None not in row.values() and int(row["update"]) <= start]
         write_csv(self._path, columns, rows)
         self.board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
 
     def write(self, row: dict[str, float]) -> None:
         """Append a row, which must have the key ``update``."""
         with self._path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns, restval="").writerow(
-                {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
-            )
+            cells = {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
+            csv.DictWriter(file, self._columns).writerow(cells)
         for key, value in row.items():
             if key != "update":
                 self.board.add_scalar(key, value, int(row["update"]))
@@ -116,10 +108,9 @@ def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        before, now = ({**x, "settings": dict(x["settings"])} for x in (state["identity"], identity))
-        if before["settings"]["updates"] < now["settings"]["updates"]:  # a run may become longer
-            del before["settings"]["updates"], now["settings"]["updates"]
-        found = differences(before, now)
+        settings = dict(state["identity"]["settings"])
+        settings["updates"] = max(settings["updates"], identity["settings"]["updates"])  # a run may become longer
+        found = differences({**state["identity"], "settings": settings}, identity)
     except Exception as error:  # torch.load raises many types on a damaged file
         raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
     if found:

@@ -104,7 +104,6 @@ class TrainSettings:
     checkpoint_every: int = 500
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_whole(1, **{name: getattr(self, name) for name in ("log_every", "validate_every", "checkpoint_every")})
         check_whole(0, updates=self.updates, warmup=self.warmup, max_skipped=self.max_skipped)
         check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
@@ -154,18 +153,14 @@ def fit(
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
             only with an equal ``identity`` and equal settings, except that ``settings.updates`` may grow. The learning
             rates and the ramp then continue as in a run of the larger number of updates.
-        data_workers: number of worker processes for each training process, see
-            :func:`~kornia_pnpnet.data.stream.stream_batches`.
+        data_workers: number of processes that draw the next batches, for each training process.
         resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
 
-    Returns:
-        The report of this call.
-
     Raises:
-        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false; when the checkpoint is damaged or
-            belongs to another run; or when more than ``settings.max_skipped`` steps were skipped. Another run has other
-            settings, solver options or ``identity``.
+        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false; when the checkpoint is damaged, or
+            its settings, solver options or ``identity`` differ; or when more than ``settings.max_skipped`` steps were
+            skipped.
         BaseError: when the batch size is not a multiple of the number of processes.
     """
     fabric = fabric or Fabric(accelerator="cpu", devices=1)
@@ -183,16 +178,10 @@ def fit(
         state = load_checkpoint(checkpoint, described)
         start, skipped, planned = state["update"], state["skipped"], state["identity"]["settings"]["updates"]
         if planned < settings.updates:
+            lr, ramp = settings.lr * settings.lr_factor(start), settings.ramp_factor(start)
             _log.warning(
-                "The run becomes longer: %s updates instead of %s. From update %s on, the schedule is that of the "
-                "longer run: learning rate %.2g, ramp of the refinement %.2g.",
-                *(
-                    settings.updates,
-                    planned,
-                    start,
-                    settings.lr * settings.lr_factor(start),
-                    settings.ramp_factor(start),
-                ),
+                f"The run becomes longer: {settings.updates} updates instead of {planned}. From update {start} on, the "
+                f"schedule is that of the longer run: learning rate {lr:.2g}, ramp of the refinement {ramp:.2g}."
             )
         model.load_state_dict(state["model"])
 
@@ -211,11 +200,10 @@ def fit(
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
     part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
-    hidden = not (progress and fabric.is_global_zero)
     # An update of the network alone is much faster than one with the refinement. Each phase has a bar and a speed.
     alone = min(settings.updates, math.ceil(settings.ramp[0] * settings.updates))
     phase = ("network alone", alone) if start < alone else (_REFINES, settings.updates)
-    bar = tqdm(None, *phase, initial=start, disable=hidden, unit="update", smoothing=0.0)
+    bar = tqdm(None, *phase, initial=start, disable=not progress or history is None, unit="update", smoothing=0.0)
     batches = stream_batches(data, start, settings.updates, data_workers)
     clock = StageClock(*_STAGES)
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
@@ -299,12 +287,11 @@ def fit(
 
 def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: float) -> LossTerms:
     """Solve the problems and compute the loss of the results."""
-    inputs = problems.world_points, problems.img_points, problems.intrinsics
     options = {**problems.known, "first_stage_only": ramp == 0.0}
     if isinstance(loss, SetLoss):
-        result, guess = solver.with_starts(*inputs, **options)
+        result, guess = solver.with_starts(*problems[:3], **options)
         return loss(result, problems, ramp, guess)
-    return loss(solver(*inputs, **options), problems, ramp)
+    return loss(solver(*problems[:3], **options), problems, ramp)
 
 
 def _any_process(fabric: Fabric, *flags: bool | Tensor) -> list[bool]:
@@ -325,11 +312,9 @@ def _report(
     """Report the work since the update ``start``. ``before`` holds the clock's seconds at the update ``start``."""
     clock.lap("rest")
     spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
-    whole = max(sum(spent.values()), 1e-9)
-    if fabric.device.type == "cuda":
-        memory = torch.cuda.max_memory_allocated(fabric.device) / 2**20
-    else:
-        memory = peak_resident_bytes() / 2**20
+    whole = sum(spent.values())
+    on_gpu = fabric.device.type == "cuda"
+    peak_bytes = torch.cuda.max_memory_allocated(fabric.device) if on_gpu else peak_resident_bytes()
     return FitReport(
         start=start,
         update=update,
@@ -338,20 +323,17 @@ def _report(
         seconds=whole,
         updates_per_second=(update - start) / whole,
         time_shares={stage: seconds / whole for stage, seconds in spent.items()},
-        peak_memory_mib=memory,
+        peak_memory_mib=peak_bytes / 2**20,
     )
 
 
 def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) -> Path:
-    """Train a new PnP-Net for n = 9 for a short time, to show that training works on this machine.
+    """Train a new PnP-Net for n = 9 for a short time, and return the path of the learning curves (CSV).
 
     Args:
         seconds: approximate duration. The number of updates follows from a short measurement of the machine's speed.
         folder: folder of the run. An earlier run in this folder is replaced.
         progress: show a progress bar.
-
-    Returns:
-        Path of the learning curves, a CSV file.
 
     Raises:
         BaseError: when ``seconds`` is not a positive number.
@@ -366,14 +348,13 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
         model = PnPNet(MLPInit(9), RobustWeightedLM(5))
     data = SyntheticProblems(n=9, batch_size=250, seed=0, outliers=OutlierMix())
     validation = {
-        name: SyntheticProblems(n=9, batch_size=500, seed=seed, outliers=mix).batch(0)
-        for name, seed, mix in (("none", 900_001, None), ("uniform", 900_002, OutlierMix()))
+        "none": SyntheticProblems(n=9, batch_size=500, seed=900_001).batch(0),
+        "uniform": SyntheticProblems(n=9, batch_size=500, seed=900_002, outliers=OutlierMix()).batch(0),
     }
     loss = PoseLoss(saturation=0.02)
 
     def try_update(ramp: float) -> None:
-        problems = data.batch(0)
-        loss(model(*problems[:3], first_stage_only=ramp == 0.0), problems, ramp).total.backward()
+        _compare(model, loss, data.batch(0), ramp).total.backward()
 
     alone = TrainSettings(0).ramp[0]  # share of the run before the refinement starts
     fast, slow = (timeit.timeit(partial(try_update, ramp), number=10) / 10 for ramp in (0.0, 1.0))

@@ -36,9 +36,9 @@ __all__ = [
 ]
 
 RESULTS_NAME = "results.json"
-# Problems per timed call, and largest number and seconds of timed calls. The shortest time is reported, because other
-# work on the machine only adds time.
-_TIMED_PROBLEMS, _TIMED_CALLS, _TIMED_SECONDS = 1000, 20, 5.0
+# Problems per timed call, and number of timed calls. The shortest time is reported, because other work on the machine
+# only adds time.
+_TIMED_PROBLEMS, _TIMED_CALLS = 1000, 10
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,6 @@ class RunResults:
     origin: RunResults | None = None
 
     def __post_init__(self) -> None:
-        """Check the number of validation sets and of hyperparameters."""
         if not self.validation:
             raise ValueError("validation is empty, expected at least one validation set")
         iterations = max(1, self.model["refine"]["m"])
@@ -163,14 +162,10 @@ class RunResults:
 
 @torch.no_grad()
 def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, ValidationResult]:
-    """Solve the problems of each validation set and summarise the errors by the name of the set.
-
-    Raises:
-        ValueError: when a set has no problems.
-    """
+    """Solve the problems of each validation set and summarise the errors by the name of the set."""
     results = {}
     for name, problems in validation.items():
-        result = model(problems.world_points, problems.img_points, problems.intrinsics, **problems.known)
+        result = model(*problems[:3], **problems.known)
         refined, first = (pose_errors(pose, problems.pose) for pose in (result.pose, result.init))
         rates = success_rate(success(refined)), success_rate(success(first))
         results[name] = ValidationResult(*rates, *(part.median().item() for part in (*refined, *first)))
@@ -186,17 +181,10 @@ def run_results(
     overrides: list[str],
     origin: RunResults | None = None,
 ) -> RunResults:
-    """Measure a trained solver and gather the :class:`RunResults` of its run.
-
-    Raises:
-        ValueError: when there is no validation set.
-    """
+    """Measure a trained solver and gather the :class:`RunResults` of its run. At least one validation set is needed."""
     *_, last = validation.values()
     part = last.map(lambda x: x[:_TIMED_PROBLEMS])
-    inputs = part.world_points, part.img_points, part.intrinsics
-    seconds: list[float] = []
-    while len(seconds) < _TIMED_CALLS and sum(seconds) < _TIMED_SECONDS:
-        seconds.append(timeit.timeit(lambda: model(*inputs, **part.known), number=1))
+    seconds = timeit.repeat(lambda: model(*part[:3], **part.known), repeat=_TIMED_CALLS, number=1)
     learned = model.refine.hyperparameters(torch.zeros((), dtype=torch.float64))
     model_config: Any = model.config()
     made_with: Any = environment()
@@ -224,14 +212,12 @@ def load_run(path: str | Path) -> RunResults:
 
 
 def find_results(weights: str | Path) -> RunResults | None:
-    """Find the results of the run that trained some weights.
+    """Load the results of the run that trained some weights; ``None`` if there is no results file.
+
+    The file is in the folder of the weights or, if this folder has the name ``weights``, in the parent folder.
 
     Args:
         weights: name or folder of the weights, see :func:`~kornia_pnpnet.pretrained.find_weights`.
-
-    Returns:
-        The results, or ``None`` if there is no results file. The file is in the folder of the weights. If this folder
-        has the name ``weights``, the file can also be in the parent folder.
 
     Raises:
         FileNotFoundError: when the weights do not exist.
@@ -245,15 +231,12 @@ def find_results(weights: str | Path) -> RunResults | None:
 
 
 def summarize_runs(folder: str | Path) -> Path | None:
-    """Write ``summary.csv`` with one row for each run of a sweep: overrides, speed and success.
+    """Write ``summary.csv`` with one row for each run in a sub-folder of ``folder``: overrides, speed and success.
 
-    The runs are in sub-folders of ``folder``. A results file that cannot be read is left out with a warning.
+    A results file that cannot be read is left out with a warning.
 
     Returns:
         Path of the summary, or ``None`` when no run has results.
-
-    Raises:
-        OSError: when the summary cannot be written.
     """
     folder = Path(folder)
     rows: list[dict[str, Any]] = []

@@ -1,0 +1,423 @@
+"""Peers: solvers of other libraries with the call signature of PnPNet, for comparisons on the same problems.
+
+The constructor of a solver imports the solver's library.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from dataclasses import dataclass, field, fields
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from kornia.core.check import KORNIA_CHECK
+from kornia.core.exceptions import ShapeError
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor, nn
+
+from kornia_pnpnet.arguments import checked_inputs, restore_leading
+from kornia_pnpnet.cameras import pinholes, reproject
+from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.extras import needs
+from kornia_pnpnet.problem import MIN_PAIRS
+from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
+
+__all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]
+
+
+class PeerPose(NamedTuple):
+    """A peer's solution of one problem, in float64."""
+
+    rotation: np.ndarray  #: World-to-camera rotation, shape :math:`(3, 3)`.
+    translation: np.ndarray  #: World-to-camera translation, shape :math:`(3,)`.
+    inliers: np.ndarray  #: Whether the library reports a pair as an inlier, bool, shape :math:`(N,)`.
+    init: tuple[np.ndarray, np.ndarray] | None = None  #: Pose before the last refinement; ``None``: not reported.
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class PeerSolver(nn.Module):
+    r"""A batched layer around a solver of another library. The library solves one problem at a time.
+
+    A subclass is a dataclass that implements :meth:`solve_one`. The fields are the arguments of the constructor. The
+    library gets the pairs that are present and have a weight above 0, but not the weights. A problem without a pose has
+    ``ok=False``, and its pose is the identity. A problem is not solved if it has fewer than three pairs, a negative
+    weight, a value that is not finite, or a camera with skew or a focal length of 0.
+
+    Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
+
+    Args:
+        threshold: largest reprojection error of an inlier in pixels; infinite if every pair is an inlier.
+
+    Raises:
+        ImportError: when the library is not installed.
+        BaseError: for an argument out of range, or an option that the installed library does not have.
+    """
+
+    threshold: float
+    #: Name of the module to import, and name of the library for error messages.
+    source: ClassVar[tuple[str, str] | None] = None
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        check_positive(or_infinite=True, threshold=self.threshold)
+        if self.source is not None:
+            self.library()
+
+    def library(self) -> ModuleType:
+        """Import the library, or raise an ``ImportError`` that names the extra to install."""
+        assert self.source is not None
+        module, name = self.source
+        with needs("eval", f"This solver needs {name}"):
+            return importlib.import_module(module)
+
+    def config(self) -> dict[str, float | int | str | bool]:
+        """Return the arguments of the constructor as plain data."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.init}
+
+    def extra_repr(self) -> str:
+        """Show the arguments of the constructor."""
+        return ", ".join(f"{key}={value!r}" for key, value in self.config().items())
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        r"""Solve one problem with the library.
+
+        Args:
+            world_points: shape :math:`(N, 3)`, float64, finite.
+            img_points: pixels, shape :math:`(N, 2)`.
+            intrinsics: shape :math:`(3, 3)`.
+
+        Returns:
+            The solution, or ``None`` when the library finds no pose.
+        """
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def forward(
+        self,
+        world_points: Tensor,
+        img_points: Tensor,
+        intrinsics: Tensor | PinholeCamera,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> PnPResult:
+        r"""Solve a batch of problems, one after the other, on the CPU in float64.
+
+        For arguments and errors see :meth:`~kornia_pnpnet.solver.PnPNet.forward`. Bearings raise ``ShapeError``.
+
+        Returns:
+            The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. The dtype is
+            float64 if an input is float64, else float32. A weight is 1 if the library reports the pair as an inlier,
+            else 0. The cost in px² is the mean squared reprojection error of the pairs that the library gets, each at
+            most the squared threshold.
+        """
+        size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
+        if inputs.rig is not None:
+            got = tuple(img_points.shape)
+            message = f"Solvers of other libraries take pixels (B, N, 2), got the shape {got}."
+            raise ShapeError(message, actual_shape=got, expected_shape=["B", "N", "2"])
+        like, largest = inputs.world_points, torch.finfo(inputs.world_points.dtype).max
+        world, img, cameras = (x.detach().cpu().double() for x in inputs[:3])
+        present = torch.ones_like(world[..., 0], dtype=torch.bool) if inputs.mask is None else inputs.mask.cpu()
+        shares = present.double() if inputs.weights is None else inputs.weights.detach().cpu().double()
+        used = present & (shares > 0)
+        cameras, pinhole = pinholes(cameras)
+        pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)  # no peer supports skew
+        # Not every peer supports a negative focal length, so that peers get the reflected image.
+        signs = cameras.diagonal(dim1=1, dim2=2).sign()
+        img, cameras = img * signs[:, None, :2], signs[..., None] * cameras
+        sound = world.isfinite().all(-1) & img.isfinite().all(-1) & shares.isfinite() & (shares >= 0) | ~present
+        status = torch.where(used.sum(-1) >= MIN_PAIRS, Status.NOT_BELIEVED, Status.TOO_FEW_PAIRS)
+        status = torch.where(pinhole, status, Status.CAMERA)
+        status = torch.where(sound.all(-1), status, Status.NOT_FINITE)
+
+        eye = torch.eye(3, 4, dtype=world.dtype, device=world.device)
+        poses = eye.repeat(2, len(world), 1, 1)  # final and initial poses
+        inliers, ok = torch.zeros_like(used), torch.zeros_like(pinhole)
+        for i in (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist():
+            found = self.solve_one(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy())
+            if found is not None:
+                both = np.stack([np.column_stack(x) for x in (found[:2], found.init or found[:2])])
+                if np.isfinite(both).all():
+                    poses[:, i], ok[i] = torch.from_numpy(both), True
+                    inliers[i, used[i]] = torch.from_numpy(np.asarray(found.inliers, dtype=bool))
+
+        errors = (reproject(world, cameras, Pose(poses[0, ..., :3], poses[0, ..., 3])) - img).square().sum(-1)
+        truncated = errors.nan_to_num(nan=math.inf).clamp(max=min(self.threshold, largest**0.25) ** 2)
+        cost = torch.where(used, truncated, 0.0).sum(-1) / used.sum(-1).clamp(min=1)
+        freedom = (2.0 * inliers.sum(-1, dtype=truncated.dtype) - 6.0).clamp(min=1.0)
+        sigma = (torch.where(inliers, truncated, 0.0).sum(-1) / freedom).sqrt()
+
+        def back(values: Tensor) -> Tensor:
+            return values.clamp(-largest, largest).to(like)
+
+        pose, init = (Pose(back(x[..., :3]), back(x[..., 3])) for x in poses)
+        result = PnPResult(
+            *pose,
+            weights=back(inliers.double()),
+            cost=back(torch.where(ok, cost, largest**0.5)),
+            ok=ok.to(like.device),
+            init=init,
+            status=torch.where(ok, Status.SOLVED, status).to(like.device, torch.int8),
+            probability=back(ok.double()),
+            alternatives=Alternatives.none(pose),
+            intrinsics=back(torch.where(pinhole[:, None, None], signs[..., None] * cameras, eye[:, :3])),
+            dist=like.new_zeros(len(like), 4),
+            sigma=back(sigma),
+            inliers=inliers.to(like.device),
+        )
+        return restore_leading(size, result)
+
+    if TYPE_CHECKING:  # nn.Module.__call__ accepts and returns Any
+        __call__ = forward
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class RobustPeer(PeerSolver):
+    """A peer that draws random samples. For the arguments see ``OpenCVRansac``.
+
+    Raises:
+        BaseError: for a ``threshold``, ``confidence``, ``seed`` or number of iterations out of range.
+    """
+
+    confidence: float = 0.9999
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(threshold=self.threshold)
+        KORNIA_CHECK(0 < self.confidence < 1, f"confidence must lie in (0, 1), got {self.confidence}.")
+        counts = {name: value for name, value in self.config().items() if name.endswith("iterations")}
+        check_whole(0, seed=self.seed)
+        check_whole(1, **counts)
+        for name, value in {**counts, "seed": self.seed}.items():
+            setattr(self, name, int(value))
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class _OpenCV(PeerSolver):
+    """A solver of OpenCV. The name of OpenCV's constant is ``kind`` followed by ``method``."""
+
+    method: str
+    kind: ClassVar[str] = "SOLVEPNP_"
+    source = "cv2", "OpenCV"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.flag()
+
+    def flag(self) -> int:
+        """Return OpenCV's constant for the method."""
+        cv2, name = self.library(), self.kind + f"{self.method}".removeprefix(self.kind)
+        usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"  # which is for fundamental matrices
+        KORNIA_CHECK(usable, f"OpenCV {cv2.__version__} has no method {self.method} for poses.")
+        return int(getattr(cv2, name))
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class OpenCVPnP(_OpenCV):
+    r"""OpenCV's ``solvePnP`` on all pairs, problem by problem. All pairs are inliers, and the cost is not truncated.
+
+    Args:
+        method: OpenCV's name of the solver, for example ``"EPNP"`` for ``SOLVEPNP_EPNP``.
+    """
+
+    threshold: float = field(default=math.inf, init=False)
+    method: str = "SQPNP"
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """See :meth:`PeerSolver.solve_one`."""
+        cv2 = self.library()
+        try:
+            found, turn, shift = cv2.solvePnP(world_points, img_points, intrinsics, None, flags=self.flag())
+        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
+            return None
+        if not found:
+            return None
+        return PeerPose(cv2.Rodrigues(turn)[0], shift.ravel(), np.ones(len(world_points), dtype=bool))
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class OpenCVRansac(_OpenCV, RobustPeer):
+    r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on the inliers, problem by problem.
+
+    The defaults are the best of a grid with thresholds from 30 to 120 px on 3000 problems of the protocol with another
+    seed, where noise of a close world point moves its pixel by 17 px. World points with less noise need a lower
+    threshold. With noisy world points, ``method="SQPNP", refine=False`` solves more problems and takes several times as
+    long, because SQPnP minimises an error in space and not in the image.
+
+    Args:
+        threshold: largest reprojection error of an inlier in pixels.
+        iterations: largest number of RANSAC iterations.
+        confidence: probability in (0, 1) of a sample without outliers, at which RANSAC stops.
+        method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
+        refine: refine the pose of RANSAC, ``PnPResult.init``, by least squares of the inliers' reprojection errors.
+        seed: seed of OpenCV's global random numbers, set before each problem.
+
+    Example:
+        >>> from kornia_pnpnet.data import SyntheticProblems
+        >>> problems = SyntheticProblems(n=9, batch_size=4, seed=0).batch(0)
+        >>> OpenCVRansac()(problems.world_points, problems.img_points, problems.intrinsics).ok
+        tensor([True, True, True, True])
+    """
+
+    threshold: float = 50.0
+    iterations: int = 1000
+    method: str = "AP3P"
+    refine: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        KORNIA_CHECK(type(self.refine) is bool, f"refine must be true or false, got {self.refine!r}.")
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """See :meth:`PeerSolver.solve_one`."""
+        cv2 = self.library()
+        cv2.setRNGSeed(self.seed)
+        options = {"iterationsCount": self.iterations, "reprojectionError": self.threshold}
+        options |= {"confidence": self.confidence, "flags": self.flag()}
+        try:
+            found, turn, shift, kept = cv2.solvePnPRansac(world_points, img_points, intrinsics, None, **options)
+            if not found or kept is None:
+                return None
+            kept = kept.ravel()
+            first = cv2.Rodrigues(turn)[0], shift.ravel().copy()
+            if self.refine and len(kept) > 3:
+                turn, shift = cv2.solvePnPRefineLM(world_points[kept], img_points[kept], intrinsics, None, turn, shift)
+            rotation = cv2.Rodrigues(turn)[0]
+        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
+            return None
+        return PeerPose(rotation, shift.ravel(), np.isin(np.arange(len(world_points)), kept), first)
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class OpenCVUsac(OpenCVRansac):
+    r"""A USAC variant of OpenCV's ``solvePnPRansac``, problem by problem.
+
+    USAC refines its pose itself. For the other arguments see :class:`OpenCVRansac`.
+
+    Args:
+        method: OpenCV's name of the variant. ``USAC_PROSAC`` expects the pairs sorted from the best to the worst.
+        seed: seed of the local optimisation only. OpenCV restarts the generator of the samples for every problem.
+    """
+
+    method: str = "USAC_ACCURATE"
+    refine: bool = field(default=False, init=False)
+    kind = "USAC_"
+
+
+def _pinhole(intrinsics: np.ndarray) -> list[float]:
+    """Focal lengths and principal point in the order of the camera model ``PINHOLE`` of COLMAP and PoseLib."""
+    return [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class KorniaRs(RobustPeer):
+    r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
+
+    kornia-rs computes in float32. Local optimisation is no option, because it solves no more of the protocol's
+    problems. For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
+
+    Args:
+        max_iterations: largest number of RANSAC iterations.
+        method: kornia-rs's name of the solver of minimal samples, ``"AP3P"`` or ``"EPnP"``.
+    """
+
+    threshold: float = 40.0
+    max_iterations: int = 1000
+    method: str = "AP3P"
+    source = "kornia_rs.k3d", "kornia-rs"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = self.method in ("AP3P", "EPnP") and hasattr(self.library().PnPSolverMethod, self.method)
+        KORNIA_CHECK(known, f"kornia-rs has no method {self.method!r}.")
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """See :meth:`PeerSolver.solve_one`."""
+        k3d = self.library()
+        options = {**self.config(), "method": getattr(k3d.PnPSolverMethod, self.method)}
+        try:
+            rotation, translation, inliers, _ = k3d.solve_pnp_ransac(world_points, img_points, intrinsics, **options)
+        except ValueError:  # no pose found, or too few pairs for the method
+            return None
+        return PeerPose(rotation, translation, inliers.astype(bool))
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class PoseLib(RobustPeer):
+    r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
+
+    For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
+
+    Args:
+        min_iterations: smallest number of RANSAC iterations. PoseLib's own 1000 solve no more problems of nine pairs.
+        max_iterations: largest number of RANSAC iterations. A problem without a pose takes this number of iterations.
+        progressive_sampling: use PROSAC, which needs pairs that are sorted from the best to the worst.
+    """
+
+    threshold: float = 40.0
+    min_iterations: int = 100
+    max_iterations: int = 10_000
+    progressive_sampling: bool = False
+    source = "poselib", "PoseLib"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        poselib = self.library()
+        unknown = self._options().keys() - poselib.RansacOptions().keys()
+        KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")
+
+    def _options(self) -> dict[str, Any]:
+        """Return the options under PoseLib's names."""
+        names = {"threshold": "max_reproj_error", "confidence": "success_prob"}
+        return {names.get(name, name): value for name, value in self.config().items()}
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """See :meth:`PeerSolver.solve_one`."""
+        camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": _pinhole(intrinsics)}
+        pose, report = self.library().estimate_absolute_pose(img_points, world_points, camera, self._options(), {})
+        if report["num_inliers"] == 0:  # PoseLib found no pose
+            return None
+        return PeerPose(pose.R, pose.t, np.array(report["inliers"]))
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class PyColmap(RobustPeer):
+    r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
+
+    For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
+
+    Args:
+        loss_scale: scale of the Cauchy loss of the refinement in pixels, tuned like ``threshold``. COLMAP's own default
+            of 1 px suits world points with little noise; with the protocol's it solves several per cent fewer problems.
+        min_iterations: smallest number of RANSAC iterations.
+        max_iterations: largest number of RANSAC iterations.
+    """
+
+    threshold: float = 50.0
+    loss_scale: float = 15.0
+    min_iterations: int = 100
+    max_iterations: int = 10_000
+    source = "pycolmap", "pycolmap"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(loss_scale=self.loss_scale)
+        counts = f"min_iterations {self.min_iterations} must not exceed max_iterations {self.max_iterations}."
+        KORNIA_CHECK(self.min_iterations <= self.max_iterations, counts)
+
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """See :meth:`PeerSolver.solve_one`."""
+        pycolmap = self.library()
+        camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=_pinhole(intrinsics))
+        ransac = {"max_error": self.threshold, "confidence": self.confidence, "random_seed": self.seed}
+        ransac |= {"min_num_trials": self.min_iterations, "max_num_trials": self.max_iterations}
+        options = {"ransac": ransac}, {"loss_function_scale": self.loss_scale}
+        found = pycolmap.estimate_and_refine_absolute_pose(img_points, world_points, camera, *options)
+        if found is None:
+            return None
+        matrix = found["cam_from_world"].matrix()  # (3, 4)
+        return PeerPose(matrix[:, :3], matrix[:, 3], found["inlier_mask"])
