@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import NamedTuple
 
 import torch
@@ -122,7 +123,7 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
     """
     check_tensors(errors._asdict())
     for name, value in (("max_rotation_deg", max_rotation_deg), ("max_translation", max_translation)):
-        if not isinstance(value, (int, float, Tensor)):
+        if not isinstance(value, (Real, Tensor)):  # also NumPy's numbers
             raise TypeCheckError(f"{name} must be a number, got {type(value).__name__}.")
     rotation, translation = errors
     limit = max_translation if isinstance(max_translation, Tensor) and max_translation.ndim else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from kornia.core.exceptions import BaseError
@@ -105,3 +106,9 @@ def test_lengths_neither_overflow_nor_underflow(unit):
     estimate = Pose(torch.eye(3)[None], unit * torch.tensor([[3.0, 0.0, 4.0]]))
     for lengths in (pose_errors(estimate, truth)[1], pose_distances(estimate, truth)[1]):
         torch.testing.assert_close(lengths / unit, torch.tensor([5.0]))
+
+
+@pytest.mark.parametrize("limit", [1, 1.0, np.float32(1.0), np.int64(1), torch.tensor(1.0), torch.ones(2)])
+def test_limits_are_numbers_of_any_kind(limit):
+    errors = PoseErrors(torch.tensor([0.5, 2.0]), torch.tensor([0.5, 0.5]))
+    assert success(errors, max_translation=limit).tolist() == [True, False]

@@ -59,7 +59,7 @@ _KEY = math.pi / 4
 
 
 class Votes(NamedTuple):
-    """What the evidence takes from a problem, whatever its pose.
+    """The quantities in the evidence that do not depend on the pose.
 
     Attributes:
         pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).

@@ -26,8 +26,8 @@ __all__ = ["find_alternatives", "reconsider"]
 _LIKELY = 1e-3
 # Upper bound of the logarithm of this likelihood ratio, so that the exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum if their rotations differ by less than this number of radians, and the mean point in
-# the camera frame by less than this share of its distance from the camera.
+# Radians, and share of a distance. Two poses are the same minimum if their rotations differ by less, and if the mean
+# point moves by less, relative to its distance from the camera.
 _SAME = 0.035
 # A mirror image is refined if most residuals of the inliers are below this number times the spread of the pixels.
 _NEAR_MIRROR = 0.2
