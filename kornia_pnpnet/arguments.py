@@ -206,7 +206,7 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 
     Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay: ``Normalize`` refuses their problem.
     """
-    # Rounding of the lens depends on the memory layout.
+    # Rounding depends on the memory layout.
     inputs, dist, fisheye = map_tensors(torch.Tensor.contiguous, (inputs, dist, fisheye))
     broken = ~inputs.img_points.isfinite().all(-1)
     seen = torch.where(broken[..., None], 0.0, inputs.img_points)
@@ -217,6 +217,7 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 
 def _looking_along(inputs: Inputs) -> Inputs:
     """Convert bearings to a rig, see :func:`checked_inputs`."""
+    inputs = map_tensors(torch.Tensor.contiguous, inputs)  # rounding depends on the memory layout
     rotation, sound = bearing_cameras(inputs.img_points)
     rig = inputs.rig
     if rig is not None:  # a pair with an invalid camera becomes a pair without a direction

@@ -18,10 +18,20 @@ from torch.nn.functional import normalize
 
 from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, check_tensors, common_dtype
 from kornia_pnpnet.core.performance import full_precision
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.result import Pose
 
-__all__ = ["bearing_cameras", "bearings", "check_coefficients", "focal_length", "pinholes", "reproject", "undistort"]
+__all__ = [
+    "bearing_cameras",
+    "bearings",
+    "check_coefficients",
+    "focal_length",
+    "pinholes",
+    "reproject",
+    "scaled_cameras",
+    "undistort",
+]
 
 # Numbers of distortion coefficients that Kornia and OpenCV accept.
 _COEFFICIENTS = (4, 5, 8, 12, 14)
@@ -71,12 +81,15 @@ def undistort(
         to_pixels = camera[:, None, :2, :2]
         # Only the upper triangle is read. A matrix that has other entries is no camera, and can be singular.
         jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
-        # An unknown sigma (NaN) is replaced first, so that the gradient of the camera is not NaN.
-        unknown, factor = noise.img.isnan(), (0.5 * jacobian.square().sum((-1, -2))).sqrt()
-        noise = noise._replace(img=torch.where(unknown, torch.nan, torch.where(unknown, 0.0, noise.img) * factor))
+        # Numbers that are not finite, such as an unknown sigma, stay. They do not affect the gradient of the camera.
+        factor, finite = (0.5 * jacobian.square().sum((-1, -2))).sqrt(), noise.img.isfinite()
+        noise = noise._replace(img=torch.where(finite, torch.where(finite, noise.img, 0.0) * factor, noise.img))
         if noise.img_cov is not None:
             (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
-            noise = noise._replace(img_cov=noise.img_cov.mapped(a, b, d, c))
+            finite = torch.stack([*noise.img_cov]).isfinite().all(0)
+            cov = map_tensors(lambda x: torch.where(finite, x, 0.0), noise.img_cov).mapped(a, b, d, c)
+            cov = map_tensors(lambda x, y: torch.where(finite, x, y), cov, noise.img_cov)
+            noise = noise._replace(img_cov=cov)
     return pixels, found, noise
 
 
@@ -156,7 +169,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
         tensor([[5.]])
     """
     check_form(["*", "3"], rays=rays)
-    common_dtype({"rays": rays})
+    rays = rays.to(common_dtype({"rays": rays}))
     largest = rays.detach().abs().amax(-1, keepdim=True)  # squares of other units could overflow or underflow
     sound = (largest > 0) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
@@ -172,19 +185,24 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Scale camera matrices (*, 3, 3) to a last entry of 1, and tell which are valid, bool (*).
 
-    A valid matrix has focal lengths that are not 0. The fourth powers of its entries and of the inverses of its focal
-    lengths are finite, and the squares of its last entry and of the inverse. An invalid matrix becomes the identity,
-    without gradient.
+    Invalid matrices become the identity, without gradient. See :func:`scaled_cameras`.
     """
-    last, limit = intrinsics.detach()[..., 2:, 2:], torch.finfo(intrinsics.dtype).max ** 0.25
-    scaled = intrinsics.detach() / last
-    sound = (scaled.abs() < limit).flatten(-2).all(-1)
-    sound = sound & (scaled.diagonal(dim1=-2, dim2=-1).abs() > 1.0 / limit).all(-1)
-    last = last.abs()[..., 0, 0]
-    sound = sound & (last < limit**2) & (last > limit**-2)
+    entries, sound = scaled_cameras(intrinsics.flatten(-2).movedim(-1, 0))
     eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
-    safe = torch.where(sound[..., None, None], intrinsics, eye)
-    return safe / safe[..., 2:, 2:], sound
+    return torch.where(sound[..., None, None], entries.movedim(0, -1).unflatten(-1, (3, 3)), eye), sound
+
+
+def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
+    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Invalid ones become all ones."""
+    limit = torch.finfo(camera.dtype).max ** 0.25
+    entries = camera.detach()
+    scaled = entries / entries[8:]
+    # The sum of absolute values bounds each value. NaN compares false.
+    largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].reciprocal())).abs().sum(0)
+    below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
+    fine = (largest < limit) & ~below_diagonal
+    camera = torch.where(fine, camera, 1.0)
+    return camera / camera[8:], fine
 
 
 def focal_length(camera: Tensor) -> Tensor:

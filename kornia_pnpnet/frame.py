@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_pnpnet.cameras import scaled_cameras
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import span_a_plane
@@ -189,7 +190,8 @@ class Normalize(Configured):
         zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
         # In a rig `cameras` holds the entries of each pair's matrix, (9, N, B).
         cameras = intrinsics.flatten(-2)
-        cameras, is_camera = _pinhole((cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)).contiguous())
+        cameras = cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)
+        cameras, is_camera = scaled_cameras(cameras.contiguous())
         camera = cameras[:, None] if intrinsics.ndim == 3 else cameras  # (9, 1 or N, B)
 
         # Fourth powers of numbers between `limit` and its inverse neither overflow nor underflow. NaN compares false.
@@ -318,19 +320,6 @@ def _is_usable(noise: Noise, given: Tensor, size: Tensor) -> Tensor:
     world_cov = map_tensors(lambda x: x.detach() / size[:, None] / size[:, None], noise.world_cov)
     covariances = noise._replace(world_cov=world_cov).covariances
     return torch.stack([*usable, *((are_semi_definite(x) | ~given.mT).all(-1) for x in covariances)]).all(0)
-
-
-def _pinhole(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, B) to a last entry of 1, and tell which are valid. Invalid matrices become all ones."""
-    limit = torch.finfo(camera.dtype).max ** 0.25
-    entries = camera.detach()
-    scaled = entries / entries[8:]
-    # The sum of absolute values bounds each value. NaN compares false.
-    largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].reciprocal())).abs().sum(0)
-    below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
-    fine = (largest < limit) & ~below_diagonal
-    camera = torch.where(fine, camera, 1.0)
-    return camera / camera[8:], fine
 
 
 def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Tensor]:

@@ -57,7 +57,7 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
         :math:`\theta`, and the translation distance :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
-        BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.
+        BaseError: when shapes are not as above, or dtypes or devices differ.
 
     Example:
         >>> eye = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -70,6 +70,7 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
     translation = estimate.translation - truth.translation
     if origin is not None:
         check_shapes({"origin": (origin, tuple(translation.shape))})
+        check_like({"origin": origin}, translation, "the translation of the estimate")
         translation = translation + (rotation * origin[..., None, :]).sum(-1)
     return lengths(rotation.flatten(-2)), lengths(translation)
 

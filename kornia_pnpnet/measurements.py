@@ -74,6 +74,10 @@ def heatmap_keypoints(
     check_positive(stride=stride)
     if isinstance(temperature, Tensor):
         check_devices({"temperature": temperature}, heatmaps, "heatmaps")
+        sizes = zip(temperature.shape[::-1], heatmaps.shape[::-1], strict=False)
+        fits = all(size in (1, other) for size, other in sizes)
+        shapes = f"{tuple(temperature.shape)} and {tuple(heatmaps.shape)}"
+        KORNIA_CHECK(fits, f"temperature must broadcast to the shape of heatmaps, got {shapes}.")
     else:
         check_positive(temperature=temperature)
     logits = heatmaps.to(common_dtype({"heatmaps": heatmaps})) / temperature

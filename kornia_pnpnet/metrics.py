@@ -90,7 +90,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
 
 @full_precision
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
-    r"""Errors of estimated poses, rotations :math:`(B, 3, 3)` and translations :math:`(B, 3)`.
+    r"""Errors of estimated poses. Rotations have the shape :math:`(B, 3, 3)`, and translations :math:`(B, 3)`.
 
     Raises:
         BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.

@@ -49,7 +49,8 @@ class PeerSolver(nn.Module):
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
     Args:
-        threshold: largest reprojection error of an inlier in pixels; infinite if every pair is an inlier.
+        threshold: largest reprojection error of an inlier in pixels. A solver that takes every pair as an inlier has
+            an infinite threshold.
 
     Raises:
         ImportError: when the library is not installed.

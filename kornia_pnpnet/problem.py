@@ -177,7 +177,7 @@ class Problem(NamedTuple):
         return (self.rig.rotation * rays[..., None]).sum(-2)
 
     def seen_with(self, zoom: Tensor) -> Problem:
-        """The same pairs with a known focal length: ``focal`` times the exponential of ``zoom``, (B, 1) or (B, 0).
+        """The same pairs with the known focal length ``focal * exp(zoom)``. ``zoom`` has the shape (B, 1) or (B, 0).
 
         Pixels and their noise are divided by the exponential of ``zoom``, because all problems share ``focal``.
         """

@@ -70,9 +70,9 @@ class PnPNet(PretrainedMixin):
     v up.
 
     Precision: the layer computes in float64 if any input tensor is float64, else in float32. Results have the dtype of
-    the computation. Inputs of float16, bfloat16 and integers are converted, because half precision has too few digits
-    for a pixel. The gradient of each input has the dtype of the input. :class:`torch.autocast` does not change the
-    results.
+    the computation. Integer inputs are converted. Inputs in float16 or bfloat16 are also converted, because half
+    precision has too few digits for a pixel. The gradient of each input has the dtype of the input.
+    :class:`torch.autocast` does not change the results.
 
     Args:
         init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to
@@ -183,8 +183,8 @@ class PnPNet(PretrainedMixin):
                 of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras without their
                 extrinsics. In a rig, each pair may have a matrix, shape :math:`(B, N, 3, 3)`. With bearings, ``None``
-                is allowed. Sigmas and thresholds of bearings are in radians without intrinsics, else in pixels at the
-                given focal length.
+                is allowed. If intrinsics are given, sigmas and thresholds of bearings are in pixels at the given focal
+                length; otherwise, they are in radians.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses

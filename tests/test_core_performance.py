@@ -58,8 +58,12 @@ def problems(count, n=9, dtype=torch.float64):
     ],
 )
 def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, cameras, backend):
-    solvers = [create_solver(name, m=2, views=views, effort="fixed" if cameras > 1 else None) for _ in range(2)]
-    tolerance = 1e-4 if name == "pnpnet-set" else 1e-6  # its softmax in float32 rounds otherwise in a graph
+    # The set's softmax and the search for rigs round otherwise in a graph, and some of their parts run on demand.
+    is_set = name == "pnpnet-set"
+    solvers = [
+        create_solver(name, m=12 if is_set else 2, views=views, effort="fixed" if is_set else None) for _ in "ab"
+    ]
+    tolerance = 1e-6 if not is_set else 1e-4 if cameras == 1 else 1e-3
     solvers[1].compile(whole=whole)
     graphs = 0
     with torch.no_grad():
@@ -107,7 +111,7 @@ def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(whole, backend):
             first = compiled(*inputs)
         assert len(caught) == 1
         for result in (first, compiled(*inputs)):
-            assert_same(result, eager(*inputs))
+            assert_same(result, eager(*inputs), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("when", ["compile", "call"])

@@ -30,6 +30,7 @@ from torch.utils import _pytree as pytree
 import kornia_pnpnet as k
 from kornia_pnpnet import PnPResult, Pose, PosePrior, Problems, Status, create_solver, metrics
 from kornia_pnpnet.cameras import bearing_cameras, bearings
+from kornia_pnpnet.core.trees import take
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
 
@@ -37,6 +38,10 @@ from kornia_pnpnet.losses import pose_distances
 FAILED = (17, 30, 46, 63, 88, 103, 106, 124, 129, 136, 147, 296, 456, 529, 544, 599, 648, 686, 694, 743, 822, 845)
 FAILED += (983, 1108, 1323, 1536, 1676, 1809, 1930, 2029, 1795734935035, 1795738409520, 1795738409574, 1795738410111)
 FAILED += (1795738410713, 1795738412044, 1795739260029, 1795739260494, 1795739261520, 1795739265465, 1795739265495)
+FAILED += (1795739260544, 1795739267340, 1795743994058, 1795743994328, 1795743995484, 1795743996800, 1795743997622)
+FAILED += (1795743997953, 1795743998144, 1795744001043, 1795745909057, 1795746991449)
+FAILED += (1795746991466, 1795748399147, 1795749698028, 1795749698789)
+FAILED += (1795749703647, 1795751187883)
 OURS = [x for x in k.list_solvers() if x.startswith(("pnpnet", "net", "epnp", "reppnp", "p3p", "ransac", "identity"))]
 PAIRS = {"p3p": 3} | {x: int(x.split("-")[1][1:]) for x in OURS if "net-n" in x}
 PROBLEM, NOISE = "world_points img_points intrinsics", "img_sigma img_cov world_sigma world_cov"
@@ -384,12 +389,15 @@ def gradients_are_finite(call: Call, found: Any) -> None:
     outputs = [x for x in pytree.tree_leaves(answers) if isinstance(x, Tensor) and x.requires_grad]
     if not outputs or ("plain" in call.target.kinds and (call.spoiled or call.unit != 1.0)):
         return
-    total = sum(torch.where(x.isfinite(), x, 0.0).sum() for x in outputs)
+    finite_numbers = [torch.where(x.isfinite(), x, 0.0) for x in outputs]
+    sizes = [x.detach().abs().amax().clamp(min=1e-30) if x.numel() else 1.0 for x in finite_numbers]
+    total = sum((x / size).sum() for x, size in zip(finite_numbers, sizes, strict=True))
     gradients = torch.autograd.grad(total, [x for _, x in inputs], materialize_grads=True)
     always = "always" in (call.args.get("gradient"), call.args.get("options", {}).get("gradient"))
     for (name, _), gradient in zip(inputs, gradients, strict=True):
-        in_range = call.unit == 1.0 and gradient.dtype != torch.float16
-        assert not (~gradient.isfinite() if in_range else gradient.isnan()).any(), f"gradient of {name} is not finite"
+        if gradient.dtype != torch.float16:  # sums of its gradients overflow
+            broken = ~gradient.isfinite() if call.unit == 1.0 else gradient.isnan()
+            assert not broken.any(), f"gradient of {name} is not finite"
         if isinstance(found, PnPResult) and name not in call.shared and not always and len(found.ok):
             assert not gradient.reshape(len(found.ok), -1)[~found.ok].any(), f"gradient of {name}, not ok"
 
@@ -405,12 +413,19 @@ def problems_are_alone(call: Call, found: Any) -> None:
         others = torch.arange(len(x)).view(-1, *[1] * (x.ndim - 1)) != i
         return torch.where(others, nan, x) if x.is_floating_point() else x
 
-    # The search and the comparison of rivals solve some problems again. The number of these problems changes rounding.
-    size = 1e-3 if isinstance(found, PnPResult) and found.ok[i] else 0.0
-    same(mapped(lambda x: x[i : i + 1], run(call, flat(call, spoil), (prod(call.size),))), here, size)
+    # The search and the comparison of rivals solve some problems again. The number of these problems changes rounding,
+    # and rounding decides which of the poses of an unsolved problem is returned.
+    beside = mapped(lambda x: x[i : i + 1], run(call, flat(call, spoil), (prod(call.size),)))
+    is_solver = isinstance(found, PnPResult)
+    is_rig = is_solver and ("cam_from_rig" in call.args or call.args["img_points"].shape[-1] == 3)
+    searches = is_rig or "ransac" in call.name or call.name.endswith("set") or "focal" in call.args.get("options", {})
+    if is_solver and searches and not found.ok[i]:
+        assert not (beside.ok & (beside.probability > 0.99)).any()
+    else:
+        same(beside, here, 1e-3 if is_solver and found.ok[i] else 0.0)
     alone = run(call, flat(call, lambda x: x[i : i + 1]), (1,))
     same(run(call, flat(call, lambda x: x[i]), ()), alone)
-    if isinstance(found, PnPResult):  # what is believed clearly
+    if is_solver:  # what is believed clearly
         if call.unit == 1.0 and (found.probability[i] - 0.5).abs() > 0.4:
             assert torch.equal(alone.ok, here.ok)
             same([*alone.pose] * bool(here.ok), [*here.pose] * bool(here.ok), 1e-2)
@@ -421,7 +436,7 @@ def problems_are_alone(call: Call, found: Any) -> None:
 def meta_has_the_same_shapes(call: Call, found: Any) -> None:
     try:
         shapes = run(call, mapped(lambda x: x.detach().to("meta"), call.args))
-    except RuntimeError as error:  # also NotImplementedError, of functions that read values
+    except (RuntimeError, ValueError) as error:  # also NotImplementedError, of functions that read values
         ours = "kornia_pnpnet" in traceback.extract_tb(error.__traceback__)[-1].filename
         if "meta" in str(error) and (ours or call.name in ("success_rate", "reliability", "diagnose")):
             return
@@ -476,8 +491,13 @@ def check(call: Call, seed: int) -> None:
         gradients_are_finite(call, found)
         found, rng = mapped(Tensor.detach, found), random.Random(seed)
         law = rng.choice([*SAME])
-        # Products of matrices are rounded in another way where gradients are recorded.
-        same(SAME[law](call), found, 1e-3 if law in ("no gradient", "inference") else 0.0)
+        changed = SAME[law](call)
+        if law in ("no gradient", "inference") and isinstance(found, PnPResult):
+            # Products of matrices are rounded in another way where gradients are recorded.
+            settled, changed = (x._replace(alternatives=take(x.alternatives, found.ok)) for x in (found, changed))
+            same(changed, settled, 1e-3)
+        else:
+            same(changed, found)
         rng.choice((problems_are_alone, meta_has_the_same_shapes))(call, found)
 
 

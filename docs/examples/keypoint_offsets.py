@@ -30,12 +30,12 @@ SEED = 20_261_150
 Solve = Callable[[Tensor, Tensor, Tensor], tuple[Pose, Tensor]]
 
 
-def ours(name: str, **noise: float) -> Solve:
-    """A solver of ours that knows the noise; problems count where it says ok."""
+def ours(name: str) -> Solve:
+    """A solver of ours; problems count where it says ok."""
     solver = create_solver(name)
 
     def solve(*inputs: Tensor) -> tuple[Pose, Tensor]:
-        result = solver(*inputs, **noise)
+        result = solver(*inputs)
         return result.pose, result.ok
 
     return solve
@@ -47,12 +47,7 @@ def kornias_dlt(*inputs: Tensor) -> tuple[Pose, Tensor]:
     return pose, pose.matrix.detach().isfinite().all(-1).all(-1)
 
 
-SOLVERS: dict[str, Solve] = {
-    # The noise includes the bias. Otherwise biased keypoints would be outliers with hardly any gradient.
-    "pnpnet-set": ours("pnpnet-set", img_sigma=BIAS, world_sigma=0.0),
-    "epnp": ours("epnp"),
-    "kornia-dlt": kornias_dlt,
-}
+SOLVERS: dict[str, Solve] = {"pnpnet-set": ours("pnpnet-set"), "epnp": ours("epnp"), "kornia-dlt": kornias_dlt}
 COLOURS = dict(zip(SOLVERS, (BLUE, ORANGE, GREEN), strict=True))
 
 

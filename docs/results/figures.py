@@ -489,20 +489,23 @@ def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapp
 
 
 @themed
-def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mapping[str, Any]) -> Path:
+def plot_real_matches(
+    path: str | Path, results: Mapping[str, Any], costs: Mapping[str, Any], titles: Mapping[str, str]
+) -> Path:
     """Draw success and time of raw matches against the share of outliers, and time against the number of pairs.
 
     ``results`` and ``costs`` are files of ``benchmarks/real_matches.py measure`` and ``cost``. Solvers of ``costs`` are
-    drawn.
+    drawn, with their ``titles``.
     """
     table = find_rows(results, "no ratio test")
     times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}
     solvers = costs["settings"]["solvers"]
     shown = {name: re.sub(r",?\w+_iterations=\d+|:threshold=\d+|effort=", "", name) for name in solvers}
-    styles = solver_styles(shown.values())
-    for name, style in styles.items():
+    looks = solver_styles(shown.values())
+    for name, style in looks.items():
         for part, look in _RAW_LOOKS.items():
             style |= look if part in name else {}
+    styles = {titles[solver]: looks[shown[solver]] for solver in solvers}
     shares, pairs = (list(pairwise(costs["settings"][key])) for key in ("shares", "pairs"))
     by_share = {f"{100 * a:.0f}–{100 * b:.0f} %": f"{100 * a:.0f}–{100 * b:.0f}" for a, b in shares}
     by_pairs = {f"{a}–{b - 1} pairs": f"{a}–{b - 1}" for a, b in pairs}
@@ -512,9 +515,9 @@ def plot_real_matches(path: str | Path, results: Mapping[str, Any], costs: Mappi
         there = [group for group in groups if (solvers[0], group) in times]
         for name in solvers:
             heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g in there]
-            axes.plot(np.arange(len(there)), heights, **styles[shown[name]])
+            axes.plot(np.arange(len(there)), heights, **styles[titles[name]])
         axes.set_xticks(range(len(there)), [groups[group] for group in there], rotation=40, ha="right")
-        axes.set(xlabel=label, title="right poses (%)" if value == "success" else "ms per problem")
+        axes.set(xlabel=label, title="solved (%)" if value == "success" else "ms per problem")
         if value == "ms":
             log_scale(axes, "y")
     draw_legend(figure, styles)

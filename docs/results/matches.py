@@ -90,7 +90,7 @@ def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for kind in kinds:
         base, alone = pooled[ours[0]][kind], single[ours[0]][kind]
         better = {
-            "more often right": [x for x in shown if pooled[x][kind].success.rate > base.success.rate],
+            "solving more": [x for x in shown if pooled[x][kind].success.rate > base.success.rate],
             "faster": [x for x in shown if pooled[x][kind].ms < base.ms],
             "faster with one image per call": [x for x in shown if single[x][kind].ms < alone.ms],
         }

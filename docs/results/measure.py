@@ -286,7 +286,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     for n in (9, 20):
         sound, noise = drawn(n, "none"), drawn(n, f"{n}")
         others = sound._replace(img_points=sound.img_points.roll(1, 0))
-        kinds = {"no pair wrong": sound, "pixels of other problems": others, "all pairs random": noise}
+        kinds = {"no outliers": sound, "pixels of other problems": others, "all pairs random": noise}
         names = (ANY, *((OURS,) if n == 9 else ()), "p3p-ransac", "opencv-ransac", "poselib")
         for name, other in named(names, tuned).items():
             for kind, problems in kinds.items():
@@ -296,7 +296,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     solver = solver.double()
     for n, wrong in ((12, 0), (12, 3), (20, 0), (20, 5), (50, 0), (50, 12)):
         problems = drawn(n, f"{wrong}" if wrong else "none", dtype=torch.float64, known_noise=True)
-        covariances[f"n = {n}, {wrong} wrong"] = covariance_check(solver, problems)
+        covariances[f"n = {n}, {wrong} outliers"] = covariance_check(solver, problems)
     made = {"environment": environment(), "problems": count, "tuned": dict(tuned)}
     write_json(HERE / "honesty.json", {**made, "reliability": diagrams, "ok": oks, "covariance": covariances})
 

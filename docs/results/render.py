@@ -10,7 +10,7 @@ from typing import Any
 
 from figures import paper_figures, plot_real_matches, plot_reliability, plot_sweep
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from matches import MATCHES, overview, page_facts
+from matches import MATCHES, overview, page_facts, title
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from problem_picture import plot_problem
 from rates import Rates, compare_all, interval, shown
@@ -30,7 +30,7 @@ OVERVIEW_PAGES = (REPOSITORY / "README.md", REPOSITORY / "docs" / "index.md")
 BEGIN, END = "<!-- overview:begin -->", "<!-- overview:end -->"
 # Solvers and sets of ``benchmarks/solvers.json`` in the summary of synthetic problems.
 SUMMARY_SOLVERS = (ANY, OURS, "p3p-ransac", "poselib", "pycolmap", "opencv-ransac", "opencv-usac")
-SUMMARY_SETS = {"n = 9, 0 to 3 outliers": "0–3 of 9 wrong", "n = 100, 70 outliers": "70 of 100 wrong"}
+SUMMARY_SETS = {"n = 9, 0 to 3 outliers": "0–3 of 9 outliers", "n = 100, 70 outliers": "70 of 100 outliers"}
 
 
 def written(template: str, **facts: Any) -> str:
@@ -156,7 +156,9 @@ def render() -> None:
     plot_sweep(HERE / "sweep_against_n.png", HERE / "sweep.csv", against="model.n")
     plot_sweep(HERE / "sweep_against_m.png", HERE / "sweep.csv", against="model.m")
     plot_reliability(HERE / "reliability.png", load("honesty")["reliability"])
-    plot_real_matches(HERE / "real_matches.png", load_matches()[0], load("real_matches_cost"))
+    costs, matches = load("real_matches_cost"), load_matches()[0]
+    titles = {solver: title(solver, costs["settings"]).replace("`", "") for solver in costs["settings"]["solvers"]}
+    plot_real_matches(HERE / "real_matches.png", matches, costs, titles)
     plot_problem(HERE / "problem.png")
     for path, text in pages().items():
         path.write_text(text, encoding="utf-8")

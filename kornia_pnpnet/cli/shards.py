@@ -61,7 +61,7 @@ def solve_shards(
     Args:
         solve: the solver.
         sources: shards, or folders of shards.
-        out: folder of the results, without shards.
+        out: folder of the results. None of the shards may be in this folder.
         name: name of the solver. Results files store this name and the digest of the solver's parameters.
         batch: largest number of problems that are read and solved at once.
         overwrite: also solve the shards that have results.

@@ -49,7 +49,7 @@ def in_full_precision(device: str) -> AbstractContextManager[Any]:
 
 
 def full_precision(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Disable autocast in a function. The first tensor of its arguments has the device."""
+    """Disable autocast in a function, on the device of the first tensor among its arguments."""
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:

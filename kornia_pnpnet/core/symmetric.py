@@ -77,7 +77,7 @@ class Symmetric3(NamedTuple):
 
     def divided(self, length: Tensor) -> Symmetric3:
         """Divide lengths by a length, and add a multiple of the identity that exceeds the entries' rounding errors."""
-        # An entry of 0 gives the length no gradient. If the square of the length underflows, it would be NaN.
+        # An entry of 0 gives the length no gradient. The gradient would be NaN if the square of the length underflowed.
         lengths = (torch.where(x == 0, length.detach(), length) for x in self)
         xx, xy, xz, yy, yz, zz = (x / unit / unit for x, unit in zip(self, lengths, strict=True))
         more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()

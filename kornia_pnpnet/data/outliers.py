@@ -62,7 +62,7 @@ class OutlierMix:
             shifted copy of the problem's points.
         mirrored_share: probability that a problem also mirrors the copy of the points for its structured outliers.
         crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
-            leader. Each problem draws the probability that an outlier joins a crowd uniformly from 0 to 1.
+            leader. For each problem, the probability that an outlier joins a crowd is drawn uniformly from 0 to 1.
         max_crowds: largest number of crowds. Each problem draws its number uniformly from 1 to ``max_crowds``.
         point_crowd_share: probability that all crowds of a problem have the leaders' world points, not their pixels.
 

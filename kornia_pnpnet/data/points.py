@@ -1,4 +1,4 @@
-"""Priors of points in the camera's frame: the protocol's box, slabs, objects, façades, rooms, drives.
+"""Priors of points in the camera's frame: the protocol's box, slabs, objects, façades, rooms, and views from a car.
 
 A new prior is a class with the method ``__call__`` of :class:`PointPrior`. An argument of two numbers is a range.
 """

@@ -216,7 +216,7 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """Reorder points, (B, 2N, 3). Pairs that are not ``displaced``, (B, N), get the points of a bunch."""
+        """Reorder points, (B, 2N, 3). Where ``displaced``, (B, N), is false, pairs get the points of a bunch."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
         # The score of a point is the distance of its direction from the direction of the first point, plus blur.

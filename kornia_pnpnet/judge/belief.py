@@ -141,7 +141,8 @@ def _form(matrix: Tensor, vector: Tensor) -> Tensor:
     solved = solve_symmetric(shift, torch.cat((cross, last), -1))
     left, right = turn - cross.mT @ solved[..., :3], first - cross.mT @ solved[..., 3:]
     parts = last.mT @ solved[..., 3:] + right.mT @ solve_symmetric(left, right)
-    return parts[:, 0, 0].nan_to_num(torch.inf)
+    form = parts[:, 0, 0]
+    return torch.where(form.isnan(), torch.inf, form)  # ONNX has no `nan_to_num` of float64
 
 
 def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ _CLEAR = 0.9
 _WIDE_ANGLE, _WIDE_FROM, _GAP = 6.4e-3, 4, 0.4
 # The caller's rivals: factor by which the first variance is smaller, least angle from the pose, and largest share of
 # inliers of a pose that has such a rival.
-_SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.005, 0.97
+_SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.02, 0.97
 # Number of iterations of a rival at this noise, number of further iterations, and number of iterations from each start
 # of `find_alternatives`.
 _FROZEN, _FREE, _ITERATIONS = 3, 5, 12

@@ -10,7 +10,7 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import compiling, problems_last, sees_values
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, put
 from kornia_pnpnet.judge.inliers import Judged, Thresholds, judge
 from kornia_pnpnet.problem import LEAST_NOISE, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
@@ -254,10 +254,11 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
     given = map_tensors(lambda *x: torch.stack(x, 1), *constant.poses)
     search = Search(_FURTHER, problem, thresholds, chances, sigma, finds_rivals=True)
-    search.run(given, enough=_FURTHER.min_samples)
-    state = search.state
-    judged = judge(project(state, problems_last(problem)), problem, thresholds)
-    weights = torch.where(search.drawn[:, None], 1.0 / (1.0 + judged.errors), constant.weights)
+    drawn = search.run(given, enough=_FURTHER.min_samples)
+    state, weights = search.state, constant.weights
+    if len(drawn):
+        judged = judge(project(state, problems_last(problem)), problem, thresholds)
+        weights = put(weights, drawn, 1.0 / (1.0 + judged.errors[drawn]))
     others = starts.others if keep_others else None
     rival = map_tensors(lambda x: x.to(problem.weights), as_pose(search.rivals))
     return starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera), rival

@@ -98,7 +98,6 @@ class Search:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
         rivals: the best pose of each problem by a quarter of the thresholds, not improved, shape :math:`(B, 12)`.
-        drawn: whether samples of a problem were drawn, bool, shape :math:`(B,)`.
 
     Example:
         >>> from kornia_pnpnet.propose.p3p import P3P
@@ -107,7 +106,7 @@ class Search:
         >>> cam_points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
         >>> problem = Problem.of(points, 100.0 * cam_points[..., :2] / cam_points[..., 2:], 100.0)
         >>> search = Search(RANSAC(P3P()), problem, Thresholds(points.new_ones(1, 1), points.new_zeros(1, 1)))
-        >>> search.run()
+        >>> drawn = search.run()
         >>> round(search.state.pose.translation[0, 2].item(), 3)
         5.0
     """
@@ -138,7 +137,6 @@ class Search:
         self.rivals = self.poses.clone()
         self.loss = self.low.new_full((batch,), torch.inf)
         self.rival_loss, self.needed = self.loss.clone(), self.loss.double()
-        self.drawn = torch.zeros_like(self.loss, dtype=torch.bool)
 
     @property
     def state(self) -> State:
@@ -148,7 +146,7 @@ class Search:
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
         return State(Pose(rotation, pose.translation), camera)
 
-    def run(self, given: Pose | None = None, enough: float = -1.0) -> None:
+    def run(self, given: Pose | None = None, enough: float = -1.0) -> Tensor:
         """Search each problem until its samples suffice for the plan's confidence, or until all samples are drawn.
 
         Args:
@@ -156,6 +154,9 @@ class Search:
                 samples. Shapes :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
             enough: a problem with given poses is searched only if it needs more than this number of samples. The
                 inliers of its best pose determine how many samples it needs.
+
+        Returns:
+            The positions of the problems of which samples were drawn.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -171,8 +172,7 @@ class Search:
             self._improve(active, losses[hard], poses[hard])
             self._expect(active)
             active = active[self.needed[active] > enough]
-        self.drawn[active] = True
-        start = stop = 0
+        drawn, start, stop = active, 0, 0
         while len(active):
             if start < _PLAIN_SAMPLES <= stop and self.problem.rig is None:
                 self._prefer_agreement(active)
@@ -186,12 +186,13 @@ class Search:
             self._expect(active[better & unfinished])
             active = active[unfinished]
             active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
+        return drawn
 
     def run_once(self, positions: Tensor, judges: Tensor) -> None:
         """Search in one round of given samples. No shape depends on values, as compiled and exported graphs require.
 
         Args:
-            positions: positions of the pairs in the samples, shape :math:`(B, H, s)`.
+            positions: for each sample, the positions of its pairs in the problem, shape :math:`(B, H, s)`.
             judges: positions of the pairs that score all poses, shape :math:`(B, J)`; negative positions are ignored.
         """
         problems = torch.arange(positions.shape[0], device=positions.device)

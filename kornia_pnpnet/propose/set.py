@@ -33,8 +33,8 @@ _FEATURES = 14
 _SHORT = 16
 # This number is added to the attention score of padding.
 _ABSENT = -1e9
-# Minimal samples. A number is the rank of a pair in descending order of likelihood. The first six samples are a Turán
-# system: if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
+# Minimal samples. Each number is the rank of a pair in descending order of likelihood. The first six samples are a
+# Turán system: if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
 # Each entry is a number of pairs and a factor. Problems with at least this number of pairs have the samples above
 # again, with all ranks multiplied by the factor. These samples help if the likeliest pairs are outliers of one pose.

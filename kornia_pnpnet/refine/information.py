@@ -59,8 +59,8 @@ def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tenso
 def sq_standardised(projection: Projection, problem: Problem, most: Tensor) -> Tensor:
     """Compute the squared residuals (B, N) of :func:`information` with an upper bound.
 
-    ``most`` is the bound in square pixels, a scalar or (B, 1), which becomes variances by the mean precision of both
-    coordinates. Points behind the camera have this residual.
+    ``most`` is the bound in square pixels, a scalar or (B, 1). Multiplication by the mean precision of both coordinates
+    converts the bound to variances. Points behind the camera have this residual.
     """
     sq_residual, precision = information(projection, problem)
     most = most * (precision if isinstance(precision, Tensor) else 0.5 * (precision.uu + precision.vv))

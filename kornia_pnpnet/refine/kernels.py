@@ -31,7 +31,7 @@ class RobustKernel(NamedTuple):
         default: the classical value of the shape.
         lower: the smallest shape that may be learned.
         upper: the largest shape that may be learned.
-        logarithmic: whether the shape is a scale, learned in log space.
+        logarithmic: whether the shape is a scale and is therefore learned in log space.
     """
 
     loss: Callable[[Tensor, Tensor], Tensor]

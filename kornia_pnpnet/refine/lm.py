@@ -37,7 +37,7 @@ _MAX_RESIDUAL = 2.0
 # Units in the last place. With `reject_worse`, a step is rejected only if the cost rises by more than this.
 _ROUNDING = 100.0
 # Estimated noise of the points is replaced by 0 only if this raises the log-likelihood by more than this number.
-_EXPECTED = 1.0
+_EXPECTED = 2.0
 # Factors of the damping after a rejected and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
@@ -352,6 +352,7 @@ class RobustWeightedLM(Configured):
         other = (second > first + _EXPECTED).long()
         index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
         noise, mixture = taken((both, found.mixture), index)
+        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # the strides after an iteration: one graph for both
         return plan._replace(problem=plan.problem._replace(noise=noise)), now._replace(mixture=mixture)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
@@ -417,7 +418,7 @@ class RobustWeightedLM(Configured):
         return total / count
 
     def _with_gradient(self, plan: Plan, now: Progress, shape: Tensor) -> State:
-        r"""Give a converged state the gradient of a minimum, by the implicit function theorem.
+        r"""Attach the gradient of the minimiser to a converged state, by the implicit function theorem.
 
         At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
         The code adds a Newton step that has this gradient and the value 0, with the Gauss-Newton matrix if the Newton

@@ -414,7 +414,7 @@ def moved(state: State, delta: Tensor) -> State:
 
 
 def retract(pose: Pose, delta: Tensor) -> Pose:
-    r"""Move a pose of a known camera by :func:`moved`, along :math:`(\omega, v)` of shape :math:`(B, 6)`.
+    r"""Move a pose along :math:`(\omega, v)`, shape :math:`(B, 6)`, as :func:`moved` does for a known camera.
 
     Example:
         >>> pose = Pose(torch.eye(3)[None], torch.zeros(1, 3))

@@ -21,8 +21,11 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# Share of the largest eigenvalue of an information matrix, or of its unit diagonal. Smaller eigenvalues count as 0.
+# Limit for the eigenvalues of an information matrix, as a share of the largest eigenvalue, or of 1 if the matrix is
+# scaled to a unit diagonal. Smaller eigenvalues count as 0.
 _KNOWN = 1e-5
+# Squared errors in squared scales of the robust kernel. The weight of larger errors is 0 in float32.
+_LARGEST_RATIO = 100.0
 # Standard deviations. Default scale of the robust kernel.
 _SCALE = 3.0
 # Lower bound of 1 + tr(R), the denominator of the tangent vector of the rotation R from a pose to the prior.
@@ -213,13 +216,17 @@ class PoseTerm(NamedTuple):
         if state.camera.shape[1]:  # a zoom moves the camera along its axis, see `moved`
             columns += [state.pose.translation[:, 2:, None] * by_shift[..., 2:]]
             columns += [torch.zeros_like(state.radial)[:, None].expand(-1, 6, -1)]
-        return Linear(error, torch.cat(columns, 2), self.information, torch.exp(-square / self.sq_scale))
+        return Linear(error, torch.cat(columns, 2), self.information, torch.exp(-self._ratio(square)))
 
     def loss(self, state: State) -> Tensor:
         """Robust loss (Welsch) in squared standard deviations, at most the squared scale of the kernel, (B,)."""
         square = self.errors(state.pose)[1]
         scale = torch.where(self.sq_scale.isinf(), 1.0, self.sq_scale)
-        return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-square / scale))
+        return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-self._ratio(square)))
+
+    def _ratio(self, square: Tensor) -> Tensor:
+        """Ratio of squared errors to the squared scale, bounded, so that its exponential has a finite derivative."""
+        return torch.minimum(square, _LARGEST_RATIO * self.sq_scale) / self.sq_scale
 
     def disagreement(self, pose: Pose) -> Tensor:
         """See :class:`~kornia_pnpnet.problem.Term`. The penalty is at most half of ``rank``."""
@@ -228,13 +235,13 @@ class PoseTerm(NamedTuple):
 
 
 def _is_usable(prior: PosePrior, lengths: Tensor) -> Tensor:
-    """Whether numbers are bounded, the scale is positive, and the information is positive semi-definite, bool (B,)."""
+    """Whether the numbers have bounds and the information is positive semi-definite, bool (B,)."""
     information = prior.information * lengths[:, :, None] * lengths[:, None]
     numbers = [prior.pose.rotation, prior.pose.translation / lengths[:, 3:], information]
     limit = torch.finfo(prior.information.dtype).max ** 0.25
     fine = torch.stack([(x.detach().flatten(1).abs() < limit).all(1) for x in numbers]).all(0)
     if prior.scale is not None:
-        fine = fine & (prior.scale > 0)
+        fine = fine & (prior.scale > 1.0 / limit)
     known, symmetric = _correlations(torch.where(fine[:, None, None], prior.information.detach(), 0.0))
     return fine & symmetric & (known[:, 0] > -1e3 * torch.finfo(prior.information.dtype).eps)
 
