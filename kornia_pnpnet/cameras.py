@@ -79,7 +79,6 @@ def undistort(
             eye = torch.eye(2, dtype=jacobian.dtype, device=jacobian.device)
             jacobian = torch.where(found[..., None, None], jacobian, eye)
         to_pixels = camera[:, None, :2, :2]
-        # Only the upper triangle is read. A matrix that has other entries is no camera, and can be singular.
         jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
         # Numbers that are not finite, such as an unknown sigma, stay. They do not affect the gradient of the camera.
         factor, finite = (0.5 * jacobian.square().sum((-1, -2))).sqrt(), noise.img.isfinite()
@@ -193,7 +192,11 @@ def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Invalid ones become all ones."""
+    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Invalid ones become all ones.
+
+    A valid matrix has zeros below its diagonal and focal lengths that are not 0. The fourth powers of its entries and
+    of the inverses of its focal lengths and of its last entry are finite.
+    """
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
     scaled = entries / entries[8:]

@@ -235,7 +235,7 @@ class PoseTerm(NamedTuple):
 
 
 def _is_usable(prior: PosePrior, lengths: Tensor) -> Tensor:
-    """Whether the numbers have bounds and the information is positive semi-definite, bool (B,)."""
+    """Whether all numbers are in range and the information is positive semi-definite, bool (B,)."""
     information = prior.information * lengths[:, :, None] * lengths[:, None]
     numbers = [prior.pose.rotation, prior.pose.translation / lengths[:, 3:], information]
     limit = torch.finfo(prior.information.dtype).max ** 0.25
