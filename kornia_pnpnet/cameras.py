@@ -160,7 +160,8 @@ def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     r"""Rotations (B, N, 3, 3) that map directions (B, N, 3) to the z axis, and which directions are valid, bool (B, N).
 
-    An invalid direction, which is not finite or 0, gets a constant rotation.
+    An invalid direction, which is not finite or shorter than the square root of the least normal number, gets a
+    constant rotation.
 
     Example:
         >>> rotation, _ = bearing_cameras(torch.tensor([[[3.0, 0.0, -4.0]]]))
@@ -170,7 +171,8 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     check_form(["*", "3"], rays=rays)
     rays = rays.to(common_dtype({"rays": rays}))
     largest = rays.detach().abs().amax(-1, keepdim=True)  # squares of other units could overflow or underflow
-    sound = (largest > 0) & largest.isfinite()
+    # The gradient of a shorter direction would overflow.
+    sound = (largest > torch.finfo(rays.dtype).tiny ** 0.5) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
     rays = normalize(torch.where(sound, rays, axis) / torch.where(sound, largest, 1.0), dim=-1)
     behind = torch.tensor([1.0, -1.0, -1.0], dtype=rays.dtype, device=rays.device)  # a half turn about x

@@ -201,8 +201,8 @@ class Normalize(Configured):
         sizes = rows.detach().abs()
         if padded:
             sizes = torch.where(given, sizes, zero)
-        # The sum is tested, because the maximum of ONNX Runtime ignores NaN. A sum in float32 could overflow.
-        is_finite = sizes.sum((0, 1), dtype=torch.float64) < torch.inf
+        # The sum is tested, because the maximum of ONNX Runtime ignores NaN. Sums of coordinates must not overflow.
+        is_finite = sizes.sum((0, 1), dtype=torch.float64) < limits.max
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
         if rig is not None:

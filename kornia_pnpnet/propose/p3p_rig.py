@@ -36,6 +36,8 @@ _DISTANCES = 16
 _SOLUTIONS, _STEPS = 8, 6
 # A pose is a solution when the relative error of each side of the triangle is below this number.
 _EXACT = 1e-3
+# Largest difference of the product of the transposed and the rotation matrix from the identity.
+_ORTHOGONAL = 0.01
 
 
 class _Branches(NamedTuple):
@@ -168,4 +170,8 @@ def _newton(
     dual = torch.linalg.cross(world[1], normal, dim=0), torch.linalg.cross(normal, world[0], dim=0), normal
     rotation = (torch.stack(cam)[:, :, None] * (torch.stack(dual) / normal.square().sum(0))[:, None]).sum(0)
     translation = points[0] - (rotation * world_points[0]).sum(1)
+    # In a triangle that is almost a line, small errors of the sides turn the normal.
+    product = (rotation[:, :, None] * rotation[:, None]).sum(0)
+    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)[..., None]
+    exact = exact & ((product - eye).abs() < _ORTHOGONAL).all(0).all(0)
     return rotation, translation, exact & translation.isfinite().all(0)
