@@ -14,14 +14,21 @@ from kornia_pnpnet.arguments import Inputs, checked_inputs, given_cameras, joine
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Runner, in_full_precision, in_turn, sees_values
-from kornia_pnpnet.core.trees import map_tensors, put, take
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.core.watch import GradientWatch
 from kornia_pnpnet.frame import Frame, Normalize
 from kornia_pnpnet.pretrained import PretrainedMixin
 from kornia_pnpnet.problem import Problem, Starts
 from kornia_pnpnet.propose.alternatives import find_alternatives, reconsider
 from kornia_pnpnet.propose.first import propose
-from kornia_pnpnet.propose.focal import as_dist, distorted, scale_focal, with_found_focal, with_nominal_focal
+from kornia_pnpnet.propose.focal import (
+    as_dist,
+    distorted,
+    find_focal,
+    scale_focal,
+    with_found_focal,
+    with_nominal_focal,
+)
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.propose.ransac import search_on
 from kornia_pnpnet.propose.views import VIEWS
@@ -304,20 +311,10 @@ class PnPNet(PretrainedMixin):
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
-        """Solve all problems once, and solve some problems again with a better focal length."""
+        """Solve problems, and find alternatives."""
         inputs, nominal = self._with_camera(inputs)
-        attempt, result = self._with_focal(inputs, call, nominal)
-        return self._with_alternatives(attempt, result, call.alternatives) if call.alternatives else result
-
-    def _with_focal(self, inputs: Inputs, call: _Call, nominal: bool) -> tuple[_Attempt, PnPResult]:
-        """Solve all problems, and search the focal length of those that a nominal focal length leaves not ``ok``."""
-        attempt = self._attempt(inputs, call, _MORE_ITERATIONS if nominal or self.radial else 0)
-        result = attempt.result
-        if nominal and self._adapts(inputs, call):
-            rows = (~result.ok).nonzero()[:, 0]
-            if len(rows):
-                result = put(result, rows, self._attempt(with_found_focal(take(inputs, rows)), call).result)
-        return attempt, result
+        attempt = self._attempt(inputs, call, nominal=nominal)
+        return self._with_alternatives(attempt, call.alternatives) if call.alternatives else attempt.result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
         """Set an initial value of an unknown focal length, and return whether the initial value is nominal."""
@@ -325,15 +322,16 @@ class PnPNet(PretrainedMixin):
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma)
         # A network's poses fit the nominal focal length. A caller's pose does not fit this focal length.
-        free = trait(self.init, "estimates_noise") and inputs.init is None and inputs.prior is None
+        given = inputs.init is not None or inputs.prior is not None
+        free = trait(self.init, "estimates_noise") and self.refine.by_residual and not given
         if free and not self.radial:
             return inputs, True
         searched = self.radial or not trait(self.init, "finds_focal")
         return (with_found_focal(inputs, self.radial) if searched else inputs), False
 
-    def _attempt(self, inputs: Inputs, call: _Call, more: int = 0) -> _Attempt:
-        """Propose poses, refine them, and judge the best pose."""
-        adapts, rival = self._adapts(inputs, call), None
+    def _attempt(self, inputs: Inputs, call: _Call, *, nominal: bool = False) -> _Attempt:
+        """Propose poses, refine them, and judge the best pose. ``nominal``: whether the focal length is nominal."""
+        adapts, rival, replaced = self._adapts(inputs, call), None, None
         searches = adapts and self.focal == "known"  # an unknown focal length has another search
         problem, frame, starts = self._run(self._propose, inputs, call, searches and inputs.confidence is None)
         if searches:
@@ -345,10 +343,15 @@ class PnPNet(PretrainedMixin):
             camera = torch.cat((torch.zeros_like(inputs.radial[:, :1]), inputs.radial), 1)
             starts = starts._replace(camera=camera)
         plan = self._run(self.refine.begin, seen, starts)
+        more = _MORE_ITERATIONS if nominal or self.radial else 0
         plan, now = self.refine.iterate(plan, 0 if call.first_stage_only else None, more=more, run=self._run)
         found = odds = None
         if self._compares(inputs, call):
-            now, found, odds = reconsider(self.refine, plan, now, frame.valid, rival)
+            found = plan.evidence_at(now.state)
+            if nominal and adapts:
+                doubted = frame.valid & ~self.refine.judge(plan, now, found).ok
+                rival, replaced = find_focal(problem, now.state, doubted)
+            now, found, odds = reconsider(self.refine, plan, now, found, frame.valid, rival, replaced)
         refined = self._run(self.refine.judge, plan, now, found, odds)
         return _Attempt(
             problem, frame, starts, refined, self._run(self._result, problem.focal, frame, starts, refined, call)
@@ -440,9 +443,9 @@ class PnPNet(PretrainedMixin):
         return self.effort == "adaptive" or (can and not self.training)
 
     @torch.no_grad()
-    def _with_alternatives(self, attempt: _Attempt, result: PnPResult, most: int) -> PnPResult:
-        """Add to a result the other poses that explain the pairs nearly as well."""
-        frame, problem = attempt.frame, attempt.problem.seen_with(attempt.refined.state.zoom)
+    def _with_alternatives(self, attempt: _Attempt, most: int) -> PnPResult:
+        """Add to the result the other poses that explain the pairs nearly as well."""
+        frame, result, problem = attempt.frame, attempt.result, attempt.problem.seen_with(attempt.refined.state.zoom)
         found = find_alternatives(self.refine, problem, attempt.starts, frame.apply(result.pose), frame.valid, most)
         poses = frame.undo(Pose(found.rotation, found.translation))
         translation = torch.where(found.valid[..., None], poses.translation, 0.0)

@@ -95,7 +95,13 @@ def find_alternatives(
 
 
 def reconsider(
-    refine: RobustWeightedLM, plan: Plan, now: Progress, valid: Tensor, rival: Pose | None = None
+    refine: RobustWeightedLM,
+    plan: Plan,
+    now: Progress,
+    found: Evidence,
+    valid: Tensor,
+    rival: State | None = None,
+    replaced: Tensor | None = None,
 ) -> tuple[Progress, Evidence, Tensor | None]:
     """Compare refined poses with rivals, and keep the likeliest pose if the refinement has iterations by residual.
 
@@ -104,12 +110,22 @@ def reconsider(
     starts with a smaller noise, if it differs from the pose. A rival that ends more than 10 degrees from the result
     lowers the probability of the result.
 
+    Args:
+        refine: the refiner.
+        plan: the plan of the refinement.
+        now: the refined poses.
+        found: the evidence for the refined poses.
+        valid: whether a problem is valid, bool, shape :math:`(B,)`.
+        rival: the caller's rivals. ``None``: the caller has none.
+        replaced: the problems, bool :math:`(B,)`, whose refined pose the caller does not believe. The caller's rival
+            replaces this pose, and starts with the noise of its own residuals. ``None``: the likelihood decides for
+            every problem. If given, the caller's rivals of the other problems are ignored.
+
     Returns:
         For :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for them, and their
         log-odds against the rivals.
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
-    found = plan.evidence_at(now.state)
     with torch.no_grad():
         inlier = _shares(found.inlier)
         mirrored = _mirrored(pose, problem, inlier)
@@ -121,20 +137,23 @@ def reconsider(
         free, share = valid & ~plan.votes.known[:, 0] & by_residual, found.mixture.share[:, 0]
         gap = found.likelihood - found.grid[:, _WIDE_FROM:].amax(1)
         unclear = free & (share < _CLEAR) & (gap < _GAP * plan.votes.pairs.sum(-1))
-        rival = pose if rival is None else rival
-        apart = rotation_angle(rival.rotation, pose.rotation) > _APART
-        apart &= valid & (share < _CLEAR_OF_RIVALS) & by_residual
-        own = found.mixture
+        rival, own = now.state if rival is None else rival, found.mixture
         wide = own._replace(variance=own.variance.maximum(_WIDE_ANGLE**2 * found.radian))
-        narrower = torch.where(plan.votes.known, own.variance.new_ones(()), 1.0 / _SMALLER)
-        narrow = own._replace(variance=narrower * own.variance, least=narrower.square() * own.least)
-        kinds = (pose, own), (pose, wide), (mirrored, own), (rival, narrow)
+        if replaced is None:
+            apart = valid & (share < _CLEAR_OF_RIVALS) & by_residual
+            apart &= rotation_angle(rival.pose.rotation, pose.rotation) > _APART
+            narrower = torch.where(plan.votes.known, own.variance.new_ones(()), 1.0 / _SMALLER)
+            of_rival = own._replace(variance=narrower * own.variance, least=narrower.square() * own.least)
+        else:
+            unclear, mirrors, apart = unclear & ~replaced, mirrors & ~replaced, replaced
+            of_rival = plan.evidence_at(rival).mixture
+        kinds = (now.state, own), (now.state, wide), (now.state._replace(pose=mirrored), own), (rival, of_rival)
         kind, owners = torch.stack((unclear, unclear, mirrors, apart)).nonzero().unbind(1)
     if not len(owners):
         return now, found, None
-    pose, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
+    state, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
     every = taken(plan._replace(state=now.state, starts=1), owners)
-    tried = Progress.of(every.state._replace(pose=pose), mixture)
+    tried = Progress.of(state, mixture)
     step, damping, _ = plan.hyperparameters[-1]
     for i in range(_FROZEN + _FREE):
         tried = refine.by_residuals(every, tried, every.votes.known | (i < _FROZEN), step, damping)
@@ -144,6 +163,8 @@ def reconsider(
     likelihood = found.likelihood.new_full((len(kinds) + 1, len(valid)), -torch.inf)
     end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()
     likelihood[0] = found.likelihood
+    if replaced is not None:
+        likelihood[0].masked_fill_(replaced, torch.finfo(likelihood.dtype).min)
     likelihood[kind, owners] = of_ends.likelihood.nan_to_num(-torch.inf)
     end[kind, owners] = torch.arange(len(owners), device=owners.device)
     best = likelihood.argmax(0)

@@ -11,7 +11,7 @@ from torch.nn import functional
 from kornia_pnpnet.arguments import Inputs, with_undistorted
 from kornia_pnpnet.cameras import focal_length, pinholes
 from kornia_pnpnet.core.performance import ranked
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
@@ -21,7 +21,7 @@ from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.refine.terms import CameraTerm
 from kornia_pnpnet.result import Pose
 
-__all__ = ["as_dist", "distorted", "scale_focal", "with_found_focal", "with_nominal_focal"]
+__all__ = ["as_dist", "distorted", "find_focal", "scale_focal", "with_found_focal", "with_nominal_focal"]
 
 # Shortest and longest focal length of the search, in half widths of the image: fields of view of 118 and 14 degrees.
 _SHORTEST, _LONGEST = 0.6, 8.0
@@ -34,7 +34,7 @@ _SEARCHED = 2.0
 # Inlier threshold in pixels of the normalised camera. For a focal length in the middle of the range, the threshold is
 # 0.65 % of half the width of the image.
 _THRESHOLD = 10.0
-_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=1)
 
 # Lower bound of the kernel's scale in the first step of `_with_distortion`, in focal lengths. At a radius of 0.7 focal
 # lengths, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07. Each step multiplies the bound by the second number.
@@ -116,6 +116,24 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
         inputs = _zoomed(inputs, camera[:, 0])
         inputs = with_undistorted(inputs, as_dist(camera[:, 1:]), None)._replace(radial=camera[:, 1:])
     return inputs._replace(init=pose if inputs.init is None else inputs.init)
+
+
+@torch.no_grad()
+def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, Tensor]:
+    """Replace pose and focal length of problems that are ``doubted`` (B,) by those of a search.
+
+    RANSAC tries P3P at the focal lengths of a grid. Also returns in which problems the search found a pose, bool (B,).
+    """
+    rows = doubted.nonzero()[:, 0]
+    if not len(rows):
+        return state, doubted
+    some = take(problem, rows)
+    found = _FINDER(some._replace(img_scale=torch.ones_like(some.img_scale)))
+    assert found.ok is not None
+    assert found.camera is not None
+    usable = found.ok & found.camera.isfinite().all(1)
+    state = put(state, rows[usable], take(State(found.pose, found.camera), usable))
+    return state, doubted.index_put((rows,), usable)
 
 
 def _zoomed(inputs: Inputs, zoom: Tensor) -> Inputs:

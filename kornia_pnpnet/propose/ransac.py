@@ -209,7 +209,7 @@ def _trusted(problem: Problem) -> Tensor:
 
 
 @torch.no_grad()
-def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, Pose]:
+def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, State]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
     A problem is searched only when it needs more than 64 samples for a confidence of 0.999, by the inliers of the best
@@ -261,4 +261,5 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
         weights = put(weights, drawn, 1.0 / (1.0 + judged.errors[drawn]))
     others = starts.others if keep_others else None
     rival = map_tensors(lambda x: x.to(problem.weights), as_pose(search.rivals))
-    return starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera), rival
+    starts = starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera)
+    return starts, State.of(rival)

@@ -172,6 +172,7 @@ class PoseTerm(NamedTuple):
         information = information * lengths[:, :, None] * lengths[:, None]
         rank = (_correlations(information)[0] > _KNOWN).sum(-1).to(centroid)
         widest = torch.full_like(size, _SCALE) if prior.scale is None else torch.where(usable, prior.scale, _SCALE)
+        widest = torch.where(widest.isinf(), widest.detach(), widest)  # an infinite scale has no gradient
         sq_scale = 0.5 * widest.square() * rank.clamp(min=1.0)
         return cls(
             Pose(rotation, moved), information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank
