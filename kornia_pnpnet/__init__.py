@@ -2,7 +2,7 @@
 
 import lazy_loader
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Public names (see __init__.pyi) are imported at their first use. The command `pnpnet` can therefore print its help, or
 # report a missing file, without waiting for the import of PyTorch.

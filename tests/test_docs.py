@@ -46,6 +46,18 @@ COMPILE = {"compile", "export"}
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
+def test_all_files_name_the_same_version():
+    version = kornia_pnpnet.__version__
+    changelog, citation, readme = ((REPO / name).read_text() for name in ("CHANGELOG.md", "CITATION.cff", "README.md"))
+    released = re.findall(r"^## \[(\d\S*)\] - \d{4}-\d\d-\d\d$", changelog, flags=re.M)
+    assert released[0] == version
+    assert f"\nversion: {version}\n" in citation
+    assert f"version={{{version}}}" in readme
+    for section in re.split(r"^## ", changelog, flags=re.M)[1:]:  # one heading of each kind
+        kinds = re.findall(r"^### (\w+)$", section, flags=re.M)
+        assert len({*kinds}) == len(kinds)
+
+
 @pytest.mark.parametrize(
     "page",
     [pytest.param(page, id=page.stem, marks=[pytest.mark.slow] * (page.stem in COMPILE)) for page in PAGES],
