@@ -80,6 +80,7 @@ def _centre(problems: Problems) -> Tensor:
     check_pose("The pose of the problems", problems.pose)
     tensors = {name: getattr(problems, name) for name in ("world_points", "img_points", "intrinsics")}
     check_tensors(tensors)
+    check_shapes({"img_points": (problems.img_points, (*problems.world_points.shape[:-1], 2))}, problems.world_points)
     check_like(tensors, problems.pose.translation, "the translation of the truth")
     return problems.world_points.mean(-2)
 

@@ -34,7 +34,9 @@ _SEARCHED = 2.0
 # Inlier threshold in pixels of the normalised camera. For a focal length in the middle of the range, the threshold is
 # 0.65 % of half the width of the image.
 _THRESHOLD = 10.0
-_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=1)
+_FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
+# For problems that the refinement did not solve. Further iterations of the refinement replace most of the final steps.
+_FURTHER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, min_samples=64, final_steps=1)
 
 # Lower bound of the kernel's scale in the first step of `_with_distortion`, in focal lengths. At a radius of 0.7 focal
 # lengths, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07. Each step multiplies the bound by the second number.
@@ -128,7 +130,7 @@ def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, 
     if not len(rows):
         return state, doubted
     some = take(problem, rows)
-    found = _FINDER(some._replace(img_scale=torch.ones_like(some.img_scale)))
+    found = _FURTHER(some._replace(img_scale=torch.ones_like(some.img_scale)))
     assert found.ok is not None
     assert found.camera is not None
     usable = found.ok & found.camera.isfinite().all(1)
