@@ -106,8 +106,8 @@ class PnPNet(PretrainedMixin):
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
             focal length. With ``SetInit`` the refinement starts from a nominal focal length. If the result is not
-            believed, or with another initialiser, a search with P3P finds an initial focal length. A problem is not ``ok`` when
-            the pairs leave the focal length open. ``"known"``: the intrinsics give the focal length.
+            believed, or with another initialiser, a search with P3P finds an initial focal length. A problem is not
+            ``ok`` when the pairs leave the focal length open. ``"known"``: the intrinsics give the focal length.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
         radial: number of coefficients of radial distortion that are estimated with an unknown focal length, 0 to 2. The
