@@ -321,7 +321,8 @@ class PnPNet(PretrainedMixin):
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma)
-        # A network's poses fit the nominal focal length. A caller's pose does not fit this focal length.
+        # A network's poses fit the nominal focal length. A caller's pose does not. After a search for doubted problems,
+        # their refinement goes on by residual.
         given = inputs.init is not None or inputs.prior is not None
         free = trait(self.init, "estimates_noise") and self.refine.by_residual and not given
         if free and not self.radial:
