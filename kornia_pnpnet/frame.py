@@ -27,6 +27,8 @@ __all__ = ["F_CONST", "Frame", "Normalize"]
 
 #: Pixels. Focal length of the normalised camera (cameras of ETH3D have focal lengths of 3400 to 3430).
 F_CONST = 3400.0
+# Limit of the entries of given poses. Their fourth powers must be finite in float32, the dtype of the networks.
+_LARGEST_ENTRY = torch.finfo(torch.float32).max ** 0.25
 # Typical distances (see `Normalize`) from the median of the points. Centre and scale ignore points beyond `_FAR`. With
 # fewer than `_MANY` pairs the limit is `_FAR_OF_FEW`, because the typical distance of few points is inaccurate.
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
@@ -98,9 +100,8 @@ class Frame(NamedTuple):
         """Express the caller's pose, else the identity, in this frame, and tell which poses are finite, bool (B,)."""
         eye = torch.eye(3, dtype=self.size.dtype, device=self.size.device).expand(self.size.shape[0], 3, 3)
         init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
-        limit = torch.finfo(eye.dtype).max ** 0.25  # fourth powers of numbers below this limit are finite
-        values = torch.cat((init.rotation.flatten(1), init.translation / self.size[:, None]), 1)
-        usable = self.valid & (values.abs().amax(-1) < limit)
+        values = torch.cat((init.rotation.flatten(1), self.apply(init).translation), 1).detach()
+        usable = self.valid & (values.abs().amax(-1) < _LARGEST_ENTRY)
         return self.apply(gate_pose(init, usable, usable)), usable
 
 
@@ -241,7 +242,7 @@ class Normalize(Configured):
             is_finite = is_finite & has_noise
         if rig is not None:
             values = torch.cat((rig.rotation.flatten(-2), rig.translation / size[:, None, None]), -1).detach()
-            sound = (values.abs() < limit).all(-1)  # (B, N)
+            sound = (values.abs() < _LARGEST_ENTRY).all(-1)  # (B, N)
             is_finite = is_finite & (sound | ~given.mT).all(-1)
             eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
             rotation = torch.where(sound[..., None, None], rig.rotation, eye)
