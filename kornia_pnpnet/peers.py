@@ -14,18 +14,21 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import ShapeError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.cameras import pinholes, reproject
-from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.checks import check_form, check_positive, check_whole
 from kornia_pnpnet.core.extras import needs
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import MIN_PAIRS
 from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 
 __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]
+
+# Rows and columns of a camera matrix in the order of the camera model ``PINHOLE`` of COLMAP and PoseLib.
+_PINHOLE = (0, 1, 0, 1), (0, 1, 2, 2)
 
 
 class PeerPose(NamedTuple):
@@ -37,7 +40,7 @@ class PeerPose(NamedTuple):
     init: tuple[np.ndarray, np.ndarray] | None = None  #: Pose before the last refinement; ``None``: not reported.
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class PeerSolver(nn.Module):
     r"""A batched layer around a solver of another library. The library solves one problem at a time.
 
@@ -59,17 +62,16 @@ class PeerSolver(nn.Module):
 
     threshold: float
     #: Name of the module to import, and name of the library for error messages.
-    source: ClassVar[tuple[str, str] | None] = None
+    source: ClassVar[tuple[str, str]]
 
     def __post_init__(self) -> None:
         super().__init__()
         check_positive(or_infinite=True, threshold=self.threshold)
-        if self.source is not None:
+        if hasattr(self, "source"):
             self.library()
 
     def library(self) -> ModuleType:
         """Import the library, or raise an ``ImportError`` that names the extra to install."""
-        assert self.source is not None
         module, name = self.source
         with needs("eval", f"This solver needs {name}"):
             return importlib.import_module(module)
@@ -78,20 +80,10 @@ class PeerSolver(nn.Module):
         """Return the arguments of the constructor as plain data."""
         return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.init}
 
-    def extra_repr(self) -> str:
-        """Show the arguments of the constructor."""
-        return ", ".join(f"{key}={value!r}" for key, value in self.config().items())
-
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        r"""Solve one problem with the library.
+        """Solve one problem with the library, or return ``None`` when the library finds no pose.
 
-        Args:
-            world_points: shape :math:`(N, 3)`, float64, finite.
-            img_points: pixels, shape :math:`(N, 2)`.
-            intrinsics: shape :math:`(3, 3)`.
-
-        Returns:
-            The solution, or ``None`` when the library finds no pose.
+        The arrays are finite, in float64, and have the shapes ``(N, 3)``, ``(N, 2)`` and ``(3, 3)``.
         """
         raise NotImplementedError
 
@@ -115,10 +107,7 @@ class PeerSolver(nn.Module):
             most the squared threshold.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
-        if inputs.rig is not None:
-            got = tuple(img_points.shape)
-            message = f"Solvers of other libraries take pixels (B, N, 2), got the shape {got}."
-            raise ShapeError(message, actual_shape=got, expected_shape=["B", "N", "2"])
+        check_form(["*", "N", "2"], img_points=img_points)  # no bearings
         like, largest = inputs.world_points, torch.finfo(inputs.world_points.dtype).max
         world, img, cameras = (x.detach().cpu().double() for x in inputs[:3])
         present = torch.ones_like(world[..., 0], dtype=torch.bool) if inputs.mask is None else inputs.mask.cpu()
@@ -145,43 +134,40 @@ class PeerSolver(nn.Module):
                     poses[:, i], ok[i] = torch.from_numpy(both), True
                     inliers[i, used[i]] = torch.from_numpy(np.asarray(found.inliers, dtype=bool))
 
-        errors = (reproject(world, cameras, Pose(poses[0, ..., :3], poses[0, ..., 3])) - img).square().sum(-1)
+        pose, init = (Pose(x[..., :3], x[..., 3]) for x in poses)
+        errors = (reproject(world, cameras, pose) - img).square().sum(-1)
         truncated = errors.nan_to_num(nan=math.inf).clamp(max=min(self.threshold, largest**0.25) ** 2)
         cost = torch.where(used, truncated, 0.0).sum(-1) / used.sum(-1).clamp(min=1)
         freedom = (2.0 * inliers.sum(-1, dtype=truncated.dtype) - 6.0).clamp(min=1.0)
         sigma = (torch.where(inliers, truncated, 0.0).sum(-1) / freedom).sqrt()
 
-        def back(values: Tensor) -> Tensor:
-            return values.clamp(-largest, largest).to(like)
-
-        pose, init = (Pose(back(x[..., :3]), back(x[..., 3])) for x in poses)
         result = PnPResult(
             *pose,
-            weights=back(inliers.double()),
-            cost=back(torch.where(ok, cost, largest**0.5)),
-            ok=ok.to(like.device),
+            weights=inliers.double(),
+            cost=torch.where(ok, cost, largest**0.5),
+            ok=ok,
             init=init,
-            status=torch.where(ok, Status.SOLVED, status).to(like.device, torch.int8),
-            probability=back(ok.double()),
+            status=torch.where(ok, Status.SOLVED, status).to(torch.int8),
+            probability=ok.double(),
             alternatives=Alternatives.none(pose),
-            intrinsics=back(torch.where(pinhole[:, None, None], signs[..., None] * cameras, eye[:, :3])),
-            dist=like.new_zeros(len(like), 4),
-            sigma=back(sigma),
-            inliers=inliers.to(like.device),
+            intrinsics=torch.where(pinhole[:, None, None], signs[..., None] * cameras, eye[:, :3]),
+            dist=cost.new_zeros(len(cost), 4),
+            sigma=sigma,
+            inliers=inliers,
         )
-        return restore_leading(size, result)
+
+        def back(x: Tensor) -> Tensor:
+            return x.clamp(-largest, largest).to(like) if x.is_floating_point() else x.to(like.device)
+
+        return restore_leading(size, map_tensors(back, result))
 
     if TYPE_CHECKING:  # nn.Module.__call__ accepts and returns Any
         __call__ = forward
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class RobustPeer(PeerSolver):
-    """A peer that draws random samples. For the arguments see ``OpenCVRansac``.
-
-    Raises:
-        BaseError: for a ``threshold``, ``confidence``, ``seed`` or number of iterations out of range.
-    """
+    """A peer that draws random samples. For the arguments see :class:`OpenCVRansac`."""
 
     confidence: float = 0.9999
     seed: int = 0
@@ -197,7 +183,7 @@ class RobustPeer(PeerSolver):
             setattr(self, name, int(value))
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class _OpenCV(PeerSolver):
     """A solver of OpenCV. The name of OpenCV's constant is ``kind`` followed by ``method``."""
 
@@ -216,8 +202,19 @@ class _OpenCV(PeerSolver):
         KORNIA_CHECK(usable, f"OpenCV {cv2.__version__} has no method {self.method} for poses.")
         return int(getattr(cv2, name))
 
+    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        """See :meth:`PeerSolver.solve_one`."""
+        cv2 = self.library()
+        try:
+            return self._solve(cv2, world_points, img_points, intrinsics)
+        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
+            return None
 
-@dataclass(eq=False, repr=False, kw_only=True)
+    def _solve(self, cv2: Any, world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        raise NotImplementedError
+
+
+@dataclass(eq=False, kw_only=True)
 class OpenCVPnP(_OpenCV):
     r"""OpenCV's ``solvePnP`` on all pairs, problem by problem. All pairs are inliers, and the cost is not truncated.
 
@@ -225,29 +222,21 @@ class OpenCVPnP(_OpenCV):
         method: OpenCV's name of the solver, for example ``"EPNP"`` for ``SOLVEPNP_EPNP``.
     """
 
-    threshold: float = field(default=math.inf, init=False)
+    threshold: float = field(default=math.inf, init=False, repr=False)
     method: str = "SQPNP"
 
-    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """See :meth:`PeerSolver.solve_one`."""
-        cv2 = self.library()
-        try:
-            found, turn, shift = cv2.solvePnP(world_points, img_points, intrinsics, None, flags=self.flag())
-        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
-            return None
-        if not found:
-            return None
-        return PeerPose(cv2.Rodrigues(turn)[0], shift.ravel(), np.ones(len(world_points), dtype=bool))
+    def _solve(self, cv2: Any, world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
+        found, turn, shift = cv2.solvePnP(world, img, intrinsics, None, flags=self.flag())
+        return PeerPose(cv2.Rodrigues(turn)[0], shift.ravel(), np.ones(len(world), dtype=bool)) if found else None
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class OpenCVRansac(_OpenCV, RobustPeer):
     r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on the inliers, problem by problem.
 
-    The defaults are the best of a grid with thresholds from 30 to 120 px on 3000 problems of the protocol with another
-    seed, where noise of a close world point moves its pixel by 17 px. World points with less noise need a lower
-    threshold. With noisy world points, ``method="SQPNP", refine=False`` solves more problems and takes several times as
-    long, because SQPnP minimises an error in space and not in the image.
+    The defaults were tuned on problems of the protocol, where noise of a close world point moves its pixel by 17 px.
+    World points with less noise need a lower threshold. With noisy world points, ``method="SQPNP", refine=False``
+    solves more problems and takes several times as long, because SQPnP minimises an error in space.
 
     Args:
         threshold: largest reprojection error of an inlier in pixels.
@@ -273,31 +262,23 @@ class OpenCVRansac(_OpenCV, RobustPeer):
         super().__post_init__()
         KORNIA_CHECK(type(self.refine) is bool, f"refine must be true or false, got {self.refine!r}.")
 
-    def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
-        """See :meth:`PeerSolver.solve_one`."""
-        cv2 = self.library()
+    def _solve(self, cv2: Any, world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         cv2.setRNGSeed(self.seed)
         options = {"iterationsCount": self.iterations, "reprojectionError": self.threshold}
         options |= {"confidence": self.confidence, "flags": self.flag()}
-        try:
-            found, turn, shift, kept = cv2.solvePnPRansac(world_points, img_points, intrinsics, None, **options)
-            if not found or kept is None:
-                return None
-            kept = kept.ravel()
-            first = cv2.Rodrigues(turn)[0], shift.ravel().copy()
-            if self.refine and len(kept) > 3:
-                turn, shift = cv2.solvePnPRefineLM(world_points[kept], img_points[kept], intrinsics, None, turn, shift)
-            rotation = cv2.Rodrigues(turn)[0]
-        except cv2.error:  # OpenCV raises on degenerate pairs and on too few pairs
+        found, turn, shift, kept = cv2.solvePnPRansac(world, img, intrinsics, None, **options)
+        if not found or kept is None:
             return None
-        return PeerPose(rotation, shift.ravel(), np.isin(np.arange(len(world_points)), kept), first)
+        kept = kept.ravel()
+        first = cv2.Rodrigues(turn)[0], shift.ravel().copy()
+        if self.refine and len(kept) > 3:
+            turn, shift = cv2.solvePnPRefineLM(world[kept], img[kept], intrinsics, None, turn, shift)
+        return PeerPose(cv2.Rodrigues(turn)[0], shift.ravel(), np.isin(np.arange(len(world)), kept), first)
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class OpenCVUsac(OpenCVRansac):
-    r"""A USAC variant of OpenCV's ``solvePnPRansac``, problem by problem.
-
-    USAC refines its pose itself. For the other arguments see :class:`OpenCVRansac`.
+    r"""A USAC variant of OpenCV's ``solvePnPRansac``, which refines its pose itself; see :class:`OpenCVRansac`.
 
     Args:
         method: OpenCV's name of the variant. ``USAC_PROSAC`` expects the pairs sorted from the best to the worst.
@@ -305,16 +286,11 @@ class OpenCVUsac(OpenCVRansac):
     """
 
     method: str = "USAC_ACCURATE"
-    refine: bool = field(default=False, init=False)
+    refine: bool = field(default=False, init=False, repr=False)
     kind = "USAC_"
 
 
-def _pinhole(intrinsics: np.ndarray) -> list[float]:
-    """Focal lengths and principal point in the order of the camera model ``PINHOLE`` of COLMAP and PoseLib."""
-    return [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-
-
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
 
@@ -347,7 +323,7 @@ class KorniaRs(RobustPeer):
         return PeerPose(rotation, translation, inliers.astype(bool))
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
@@ -378,14 +354,14 @@ class PoseLib(RobustPeer):
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         """See :meth:`PeerSolver.solve_one`."""
-        camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": _pinhole(intrinsics)}
+        camera = {"model": "PINHOLE", "width": -1, "height": -1, "params": intrinsics[_PINHOLE]}
         pose, report = self.library().estimate_absolute_pose(img_points, world_points, camera, self._options(), {})
         if report["num_inliers"] == 0:  # PoseLib found no pose
             return None
         return PeerPose(pose.R, pose.t, np.array(report["inliers"]))
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class PyColmap(RobustPeer):
     r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
 
@@ -413,7 +389,7 @@ class PyColmap(RobustPeer):
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         """See :meth:`PeerSolver.solve_one`."""
         pycolmap = self.library()
-        camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=_pinhole(intrinsics))
+        camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=intrinsics[_PINHOLE])
         ransac = {"max_error": self.threshold, "confidence": self.confidence, "random_seed": self.seed}
         ransac |= {"min_num_trials": self.min_iterations, "max_num_trials": self.max_iterations}
         options = {"ransac": ransac}, {"loss_function_scale": self.loss_scale}

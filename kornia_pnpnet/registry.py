@@ -82,12 +82,7 @@ def _builders() -> dict[str, Callable[..., nn.Module]]:
 
 
 def list_solvers() -> list[str]:
-    """List the names that :func:`create_solver` accepts.
-
-    Example:
-        >>> "p3p-ransac" in list_solvers()
-        True
-    """
+    """List the names that :func:`create_solver` accepts."""
     return sorted(_builders())
 
 
@@ -109,11 +104,11 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Args:
         name: one of :func:`list_solvers`.
-        options: depend on the solver. Trained solvers and names with ``-lm`` take ``m``, the number of iterations (see
-            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers take the arguments of their
-            class: :class:`~kornia_pnpnet.propose.epnp.EPnP`, :class:`~kornia_pnpnet.propose.reppnp.REPPnP`,
-            :class:`~kornia_pnpnet.propose.ransac.RANSAC` or one of :mod:`kornia_pnpnet.peers`. Solvers of this package
-            also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
+        options: arguments of the solver's class: :class:`~kornia_pnpnet.propose.epnp.EPnP`,
+            :class:`~kornia_pnpnet.propose.reppnp.REPPnP`, :class:`~kornia_pnpnet.propose.ransac.RANSAC` or one of
+            :mod:`kornia_pnpnet.peers`. Trained solvers and names with ``-lm`` take ``m``, the number of iterations (see
+            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers of this package also take the
+            options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode. Its parameters do not require gradients, so that a result has a
@@ -164,16 +159,10 @@ def solve_pnp(
 ) -> Tensor:
     r"""Find world-to-camera matrices despite outliers, with the signature of :func:`kornia.geometry.solve_pnp_dlt`.
 
-    To pass masks or noise, or to get weights and a probability, call a solver of :func:`create_solver`.
-
-    Args:
-        world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
-        img_points: see ``PnPNet.forward``.
-        intrinsics: see ``PnPNet.forward``.
-        weights: see ``PnPNet.forward``.
-        solver: one of :func:`list_solvers`, or a module with the signature of a solver. Named solvers are cached.
-        dist: see ``PnPNet.forward``. Solvers of other libraries do not accept ``dist``.
-        fisheye: see ``PnPNet.forward``. Solvers of other libraries do not accept ``fisheye``.
+    To pass masks or noise, or to get weights and a probability, call a solver of :func:`create_solver`. ``solver`` is
+    one of :func:`list_solvers`, or a module with the signature of a solver. Named solvers are cached. For the other
+    arguments see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Solvers of other libraries do not accept
+    ``dist`` and ``fisheye``.
 
     Returns:
         Matrices :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`. The dtype is float64 if any

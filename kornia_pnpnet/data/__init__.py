@@ -4,13 +4,12 @@ A source is a class with ``batch_size`` and ``batch(index)``. Constructors raise
 out of its bounds.
 """
 
-from kornia_pnpnet.data.cameras import CameraProblems
 from kornia_pnpnet.data.colmap import load_scene
-from kornia_pnpnet.data.depth_maps import DepthMaps
 from kornia_pnpnet.data.mixtures import MixedPoints, MixedProblems, VaryingSize
 from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix
 from kornia_pnpnet.data.points import (
     BoxPoints,
+    DepthMaps,
     DrivePoints,
     FacadePoints,
     ObjectPoints,
@@ -19,7 +18,7 @@ from kornia_pnpnet.data.points import (
     SlabPoints,
 )
 from kornia_pnpnet.data.scenes import Scene, SceneProblems, View
-from kornia_pnpnet.data.synthetic import SyntheticProblems
+from kornia_pnpnet.data.synthetic import CameraProblems, SyntheticProblems
 
 __all__ = [
     "BoxPoints",

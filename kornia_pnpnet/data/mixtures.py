@@ -73,10 +73,9 @@ class MixedProblems:
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
         KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must know covariances, or none of them.")
-        known: dict[str, Any] = {name: _joined(parts, name) for name in ("img_sigma", "world_sigma", "confidence")}
-        unknown: dict[str, Any] = dict.fromkeys(known)
-        others = [part._replace(**unknown) for part in parts]
-        problems = map_tensors(lambda *x: torch.cat(x), *others)._replace(**known)
+        for name in ("img_sigma", "world_sigma", "confidence"):
+            parts = _alike(parts, name)
+        problems = map_tensors(lambda *x: torch.cat(x), *parts)
         return take(problems, self._order.to(problems.inliers.device))
 
 
@@ -95,14 +94,16 @@ def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], 
     return [end - start for start, end in pairwise([*bounds, batch_size])]
 
 
-def _joined(parts: list[Problems], name: str) -> Tensor | None:
-    """Concatenate the field ``name`` of all parts. Missing fields are NaN; ``None`` if all parts lack the field."""
-    known = [getattr(part, name) for part in parts]
-    dimensions = max((value.ndim for value in known if value is not None), default=0)
-    if not dimensions:
-        return None
-    joined = torch.cat([expand_sigma(name, x, part.world_points) for x, part in zip(known, parts, strict=True)])
-    return joined if dimensions > 1 else joined[:, 0]
+def _alike(parts: list[Problems], name: str) -> list[Problems]:
+    """Give the field ``name`` one number of dimensions. A part without the field gets NaN, unless all parts lack it."""
+    values = [getattr(part, name) for part in parts]
+    dimensions = {0 if value is None else value.ndim for value in values}
+    if len(dimensions) == 1:
+        return parts
+    values = [expand_sigma(name, value, part.world_points) for value, part in zip(values, parts, strict=True)]
+    if 2 not in dimensions:
+        values = [value[:, 0] for value in values]
+    return [part._replace(**{name: value}) for value, part in zip(values, parts, strict=True)]
 
 
 class MixedPoints:
@@ -111,12 +112,6 @@ class MixedPoints:
     Args:
         priors: the priors.
         shares: one positive number per prior, as in :class:`MixedProblems`.
-
-    Example:
-        >>> from kornia_pnpnet.data import BoxPoints, SlabPoints, SyntheticProblems
-        >>> points = MixedPoints([BoxPoints(), SlabPoints()], shares=[1.0, 3.0])
-        >>> SyntheticProblems(n=4, batch_size=5, points=points).batch(0).world_points.shape
-        torch.Size([5, 4, 3])
     """
 
     def __init__(self, priors: Sequence[PointPrior], *, shares: Sequence[float] | None = None) -> None:

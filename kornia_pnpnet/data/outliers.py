@@ -16,9 +16,8 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# Distance between the pixel of a near outlier and the pixel of its point, in standard deviations of the pixel noise.
-# First, the range without `near_pixels`. Second, the smallest values of the two ends of `near_pixels`.
-# A choice: the noise itself hardly exceeds 5 standard deviations.
+# Distance of a near outlier's pixel in standard deviations of the noise: the range without `near_pixels`, and the
+# smallest ends of `near_pixels`. A choice: the noise itself hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
 # This number is added to n * max_ratio before rounding down. With 0.33 the result is then floor(n / 3) for n up to 15.
 _SLACK = 0.05
@@ -90,13 +89,11 @@ class OutlierMix:
         shares = {name: value for name, value in vars(self).items() if name.endswith("_share")}
         check_numbers(0.0, 1.0, max_ratio=self.max_ratio, **shares)
         check_numbers(0.0, structured_angle=self.structured_angle)
-        check_ranges(structured_ratio=self.structured_ratio)
-        if self.near_pixels is not None:
-            check_ranges(near_pixels=self.near_pixels)
-        check_whole(0, min_count=self.min_count, min_inliers=self.min_inliers)
+        near_pixels = _NEAR if self.near_pixels is None else self.near_pixels
+        check_ranges(structured_ratio=self.structured_ratio, near_pixels=near_pixels)
+        count = 0 if self.count is None else self.count
+        check_whole(0, count=count, min_count=self.min_count, min_inliers=self.min_inliers)
         check_whole(1, max_crowds=self.max_crowds)
-        if self.count is not None:
-            check_whole(0, count=self.count)
 
     def max_count(self, n: int) -> int:
         """The largest number of outliers among ``n`` pairs."""

@@ -1,4 +1,4 @@
-"""Priors of points in the camera's frame: the protocol's box, slabs, objects, façades, rooms, and views from a car.
+"""Priors of points in the camera's frame, and the errors of points that depth cameras have measured.
 
 A new prior is a class with the method ``__call__`` of :class:`PointPrior`. An argument of two numbers is a range.
 """
@@ -6,6 +6,7 @@ A new prior is a class with the method ``__call__`` of :class:`PointPrior`. An a
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 import torch
@@ -13,10 +14,19 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges
+from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges, check_whole
 from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform, unit
 
-__all__ = ["BoxPoints", "DrivePoints", "FacadePoints", "ObjectPoints", "PointPrior", "RoomPoints", "SlabPoints"]
+__all__ = [
+    "BoxPoints",
+    "DepthMaps",
+    "DrivePoints",
+    "FacadePoints",
+    "ObjectPoints",
+    "PointPrior",
+    "RoomPoints",
+    "SlabPoints",
+]
 
 Range: TypeAlias = tuple[float, float]
 
@@ -42,6 +52,11 @@ _CAMERA_HEIGHT, _STREET_SIDE, _STREET_END = (1.0, 3.0), (2.5, 20.0), (30.0, 200.
 _YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
 # Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
+# Depth maps: standard deviation of each coordinate of a map camera about the query camera, relative to the mean
+# distance of the points. A map image then shows the same points from the side by 10 to 40 degrees.
+_BASELINE = 0.3
+# Depth maps: bounds of the change of a flying pixel's distance from its map camera, as a share of the distance.
+_FLIGHT = (-0.3, 0.6)
 
 
 class PointPrior(Protocol):
@@ -49,7 +64,6 @@ class PointPrior(Protocol):
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
         """Draw the points."""
-        ...
 
 
 class BoxPoints:
@@ -59,11 +73,6 @@ class BoxPoints:
         half_width: largest :math:`|x|` and :math:`|y|`, in the unit of the world.
         z_near: depth of the box's near face, in the unit of the world.
         depth: length of the box along the optical axis, in the unit of the world.
-
-    Example:
-        >>> points = BoxPoints(half_width=2.0, z_near=1.0, depth=3.0)(5, 9, torch.Generator().manual_seed(0))
-        >>> points.shape, bool((points[..., 2] >= 1.0).all()), bool((points[..., :2].abs() <= 2.0).all())
-        (torch.Size([5, 9, 3]), True, True)
     """
 
     def __init__(self, *, half_width: float = 10.0, z_near: float = 10.0, depth: float = 80.0) -> None:
@@ -223,3 +232,53 @@ def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Multiples of ``rays``, (..., 3), where the rays enter and leave a box. If enter >= leave, a ray misses."""
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)
+
+
+@dataclass(kw_only=True, eq=False)
+class DepthMaps:
+    r"""Errors of world points that depth cameras have measured from several map images.
+
+    Each world point comes from the depth map of one of ``maps`` cameras near the query camera. Three errors move it:
+
+    - noise along the ray of the map camera, with the standard deviation :math:`a d^2 / \bar d` at the distance
+      :math:`d`. The noise of stereo and structured light grows with the square of the distance.
+    - the error of the map camera's rotation, which turns all points of one map about this camera;
+    - *flying pixels*: at the edge of an object, the measured distance lies between object and background. These pairs
+      are outliers.
+
+    Args:
+        depth_noise: range of :math:`a`, the noise at the mean distance :math:`\bar d`, relative to this distance. Each
+            problem draws a log-uniform number.
+        angle: range of the standard deviation, in degrees, of a map camera's rotation about each axis. Each problem
+            draws a log-uniform number.
+        flying_share: probability that a point is a flying pixel.
+        maps: number of map cameras of a problem.
+    """
+
+    depth_noise: tuple[float, float] = (0.001, 0.03)
+    angle: tuple[float, float] = (0.02, 0.5)
+    flying_share: float = 0.1
+    maps: int = 3
+
+    def __post_init__(self) -> None:
+        check_ranges(depth_noise=self.depth_noise, angle=self.angle)
+        check_numbers(0.0, 1.0, flying_share=self.flying_share)
+        check_whole(1, maps=self.maps)
+
+    def __call__(self, cam_points: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw the moves of points in the query camera's frame, (B, N, 3), float64.
+
+        Also tell whether each point is a flying pixel, bool, (B, N, 1).
+        """
+        batch_size, n, _ = cam_points.shape
+        each, one = (batch_size, n, 1), (batch_size, 1, 1)
+        size = cam_points.norm(dim=-1).mean(1)[:, None, None]  # (B, 1, 1)
+        centre = _BASELINE * size * normal((batch_size, self.maps, 3), generator)
+        turn = log_uniform(one, *self.angle, generator).deg2rad() * normal(centre.shape, generator)
+        of_map = (self.maps * unit(each, generator)).long()
+        ray = cam_points - centre.take_along_dim(of_map, 1)
+        sigma = log_uniform(one, *self.depth_noise, generator)
+        change = sigma * ray.norm(dim=-1, keepdim=True) / size * normal(each, generator)  # relative to the distance
+        is_flying = unit(each, generator) < self.flying_share
+        change = torch.where(is_flying, uniform(each, *_FLIGHT, generator), change)
+        return change * ray + torch.linalg.cross(turn.take_along_dim(of_map, 1), ray), is_flying

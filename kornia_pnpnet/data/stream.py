@@ -29,7 +29,6 @@ class ProblemSource(Protocol):
 
     def batch(self, index: int) -> Problems:
         """Draw batch ``index``."""
-        ...
 
 
 def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 0) -> Generator[Problems, None, None]:

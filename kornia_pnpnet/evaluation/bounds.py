@@ -30,20 +30,13 @@ class KnownInliers(Configured):
     r"""Least squares of the reprojection errors of the true inliers, starting from the true pose.
 
     A method that must first find the inliers cannot expect a higher accuracy.
-
-    Example:
-        >>> from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-        >>> problems = SyntheticProblems(batch_size=4, seed=1, outliers=OutlierMix(count=3)).batch(0)
-        >>> result = KnownInliers().solve_with_truth(problems)
-        >>> torch.equal(result.weights > 0, problems.inliers)
-        True
     """
 
     def __init__(self) -> None:
         super().__init__(locals())
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
-        """Solve problems with the help of their true poses and inliers."""
+        """See :class:`~kornia_pnpnet.evaluation.SeesTruth`."""
         return _least_squares(problems, problems.inliers.to(problems.world_points.dtype))
 
 

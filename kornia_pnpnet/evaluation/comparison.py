@@ -47,7 +47,6 @@ class SeesTruth(Protocol):
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """Solve problems with the help of their true poses and inliers."""
-        ...
 
 
 def draw_problems(source: ProblemSource, count: int) -> Problems:

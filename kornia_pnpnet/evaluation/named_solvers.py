@@ -14,6 +14,7 @@ from torch import nn
 
 from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
 from kornia_pnpnet.evaluation.problem_sets import PRIORS
+from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, PoseLib, PyColmap
 from kornia_pnpnet.registry import create_solver, list_solvers
 from kornia_pnpnet.solver import PnPNet
 
@@ -37,12 +38,7 @@ _SCENE_OPTIONS = dict.fromkeys(
 # of another seed. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
 # Optional packages by the start of solver names: module and name of the package.
-_PACKAGES = {
-    "opencv-": ("cv2", "OpenCV"),
-    "kornia-rs": ("kornia_rs", "kornia-rs"),
-    "poselib": ("poselib", "PoseLib"),
-    "pycolmap": ("pycolmap", "pycolmap"),
-}
+_PACKAGES = {peer.source[1].lower(): peer.source for peer in (OpenCVPnP, KorniaRs, PoseLib, PyColmap)}
 
 
 def load_solver(spec: str) -> nn.Module:
@@ -93,4 +89,4 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
 def missing_package(solver: str) -> str | None:
     """The name of the package that a solver needs and that is not installed, or ``None``."""
     needed = (package for prefix, package in _PACKAGES.items() if solver.startswith(prefix))
-    return next((name for module, name in needed if importlib.util.find_spec(module) is None), None)
+    return next((name for module, name in needed if importlib.util.find_spec(module.split(".")[0]) is None), None)
