@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, Starts, pose_erro
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.evaluation.results import source_digest
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.result import Pose, Problems
@@ -49,21 +49,18 @@ class CannotBeTimedError(Exception):
     """Why a contender cannot be timed."""
 
 
-@dataclass
-class Task:
-    """A call on given problems.
+class Task(NamedTuple):
+    """A call on given problems."""
 
-    Attributes:
-        call: solves all problems once, forward, or forward and backward.
-        poses: returns the poses in the frame of the problems; not timed.
-        problems: the problems.
-        device: the device that works; a call on a GPU is timed until the GPU has finished.
-    """
-
-    call: Callable[[], Any]
-    poses: Callable[[], Pose]
+    call: Callable[[], Any]  # solves all problems once, forward, or forward and backward
+    poses: Callable[[], Pose]  # of all problems, in their frame; not timed
     problems: Problems
-    device: str = "cpu"
+    device: str = "cpu"  # a call on a GPU is timed until the GPU has finished
+
+    @property
+    def size(self) -> int:
+        """Number of problems."""
+        return len(self.problems.world_points)
 
     def seconds(self, times: int = 1) -> float:
         """Seconds of a call, the mean over ``times`` calls."""
@@ -77,6 +74,10 @@ class Task:
 
         torch.cuda.synchronize()
         return seconds(everything) / times
+
+    def us(self, times: int = 1) -> float:
+        """Microseconds per problem, the mean over ``times`` calls."""
+        return 1e6 * self.seconds(times) / self.size
 
     def warm(self) -> float:
         """Call twice, first to compile and to fill caches, and return the seconds of the second call.
@@ -111,7 +112,7 @@ def compile_or_raise(module: nn.Module, **options: bool | str) -> None:
 
 def gradient(pose: Pose, leaves: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Gradients of the sum of all entries of the poses."""
-    return torch.autograd.grad(pose.rotation.sum() + pose.translation.sum(), leaves, allow_unused=True)
+    return torch.autograd.grad(pose.rotation.sum() + pose.translation.sum(), leaves, materialize_grads=True)
 
 
 def float_inputs(problems: Problems, device: str = "cpu") -> list[Tensor]:
@@ -120,18 +121,11 @@ def float_inputs(problems: Problems, device: str = "cpu") -> list[Tensor]:
 
 
 class Contender:
-    """A solver to be timed. A subclass defines ``call``, and the other methods where they differ.
+    """A solver to be timed. A subclass defines ``call``, and the other methods where they differ."""
 
-    Attributes:
-        loops: whether problems are solved one after the other. Then a part of a batch shows the time per problem.
-        differentiable: whether there are gradients.
-        n: the only number of pairs that the solver takes, if there is one.
-        device: the device that works.
-    """
-
-    loops = False
-    differentiable = True
-    n: int | None = None
+    loops = False  # whether problems are solved one after the other: a part of a batch shows the time per problem
+    differentiable = True  # whether there are gradients
+    n: int | None = None  # the only number of pairs that the solver takes, if there is one
     device = "cpu"
 
     def takes(self, n: int) -> bool:
@@ -235,29 +229,23 @@ def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
     return Pose(turned, (cam_centre - turned @ centre)[..., 0] + shift)
 
 
-def exported(spec: str, suffix: str, export: Callable[[PnPNet, Path], object]) -> Path:
-    """Export a solver, unless ``outputs/exported`` has it from the present code: exporting takes minutes."""
-    from kornia_pnpnet.evaluation.results import source_digest
-
+def exported(spec: str, suffix: str, export: Callable[..., object]) -> Path:
+    """Export a solver for N pairs, unless ``outputs/exported`` has it from the present code: this takes minutes."""
     path = HERE.parent / "outputs" / "exported" / f"{spec}-{source_digest()[:16]}{suffix}"
     if not path.exists():
-        solver = load_solver(spec)
-        assert isinstance(solver, PnPNet)
-        export(solver, path)
+        export(load_solver(spec), path, N)
     return path
 
 
 class Packaged(Contender):
-    """A solver of this package for nine pairs, compiled ahead of time for one problem per call, in float32."""
+    """A solver of this package for N pairs, compiled ahead of time for one problem per call, in float32."""
 
-    loops, differentiable, n = True, False, 9
+    loops, differentiable, n = True, False, N
 
     def __init__(self, spec: str) -> None:
         from kornia_pnpnet.export import export_package, load_package
 
-        self.solver = load_package(
-            exported(spec, ".pt2", lambda solver, path: export_package(solver, path, 9, batch=1))
-        )
+        self.solver = load_package(exported(spec, ".pt2", partial(export_package, batch=1)))
 
     def inputs(self, problems: Problems) -> Any:
         """The inputs of each problem."""
@@ -273,16 +261,16 @@ class Packaged(Contender):
 
 
 class Onnx(Contender):
-    """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32."""
+    """A solver of this package as an ONNX model for N pairs, under ONNX Runtime, in float32."""
 
-    differentiable, n = False, 9
+    differentiable, n = False, N
 
     def __init__(self, spec: str) -> None:
         import onnxruntime
 
         from kornia_pnpnet.export import export_onnx
 
-        path = exported(spec, ".onnx", lambda solver, path: export_onnx(solver, path, 9))
+        path = exported(spec, ".onnx", export_onnx)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = 3
@@ -320,17 +308,9 @@ class Peer(Contender):
     def __init__(self, spec: str) -> None:
         self.solver = load_solver(spec)
 
-    def inputs(self, problems: Problems) -> Any:
-        """The calls for all problems."""
-        return bare_call(self.solver, problems)
-
-    def call(self, inputs: Any) -> Any:
-        """Call the library for each problem."""
-        return inputs()
-
-    def poses(self, problems: Problems, inputs: Any) -> Pose:
-        """Solve with the adapter of this package."""
-        return Pose(*self.solver(*problems[:3]).pose)
+    def task(self, problems: Problems, *, backward: bool = False) -> Task:
+        """Call the library for each problem. The poses are those of the adapter of this package."""
+        return Task(bare_call(self.solver, problems), lambda: Pose(*self.solver(*problems[:3]).pose), problems)
 
 
 class KorniaDLT(Contender):
@@ -420,11 +400,6 @@ def random_cameras(n: int, count: int, seed: int, share: float, **options: Any) 
     """Problems of random cameras in float64; ``share`` is the share of outliers."""
     options |= {"batch_size": count, "seed": seed, "outlier_share": share, "dtype": torch.float64}
     return CameraProblems(n=n, **options).batch(0)
-
-
-def first(problems: Problems, count: int) -> Problems:
-    """The first ``count`` problems of a batch."""
-    return problems.map(lambda x: x[:count])
 
 
 def relative_errors(pose: Pose, problems: Problems) -> tuple[Tensor, Tensor]:

@@ -20,9 +20,10 @@ from typing import Any
 
 import page
 import timing
-from contenders import FULL, PLAIN, QUICK, TRAINED, WHOLE, Settings, make_contenders
-from harness import HERE, Row, recorded, run_child, say, target, threads
+from contenders import ANY, FULL, PLAIN, QUICK, TRAINED, WHOLE, N, Settings, make_contenders
+from harness import HERE, Row, ratio, recorded, run_child, say, target, threads
 from page import CACHED, COLD, EAGER
+from timing import BACKWARD, FORWARD
 
 from kornia_pnpnet.evaluation.results import save_results
 
@@ -46,7 +47,7 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
         for request in requests
     ]
     found = {key: [entry for answer in answers for entry in answer[key]] for key in ("rows", "skipped")}
-    targets = timing.throughput_targets if part == "throughput" else timing.latency_targets
+    targets = throughput_targets if part == "throughput" else latency_targets
     return {**found, "targets": targets(found["rows"])}
 
 
@@ -95,6 +96,33 @@ def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]
         return [measured(cache, batches, TORCHINDUCTOR_CACHE_DIR=folder) for cache in (COLD, CACHED)]
 
 
+def throughput_targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Targets of 1000 problems of 9 pairs with 3 mismatches on one thread, where both sides were measured."""
+    here = page.matching(rows, threads=1, n=N, batch=1000, mode=FORWARD)
+    found = []
+    for name, most in (("refinement compiled", 3.0), (f"{TRAINED} compiled", 8.0)):
+        if name in here:
+            found.append(target(f"`{name}`, per problem", here[name]["median_us"], most, unit="µs"))
+    for solver, peer, least in ((TRAINED, "opencv-ransac", 20.0), (TRAINED, "poselib", 10.0), (ANY, "poselib", 5.0)):
+        mine = f"{solver} compiled"
+        if mine in here and peer in here:
+            what = f"`{mine}` against `{peer}`, {FORWARD}"
+            found.append(target(what, ratio(here[mine], here[peer]), least, unit="times as fast", at_most=False))
+    return found
+
+
+def latency_targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Targets of one problem on one thread."""
+    found = []
+    alone = page.matching(rows, threads=1)
+    for name, most_ms in {WHOLE: 0.4, f"{TRAINED} compiled": 0.4, PLAIN: 3.0, TRAINED: 3.0}.items():
+        if row := alone.get(name):
+            found.append(target(f"`{name}`, one problem, median", row["median_us"] / 1e3, most_ms, unit="ms"))
+            tail = f"`{name}`, one problem, 99th percentile by the median"
+            found.append(target(tail, row["p99_us"] / row["median_us"], 2.0))
+    return found
+
+
 def startup_targets(starts: Sequence[Row], imports: Sequence[float]) -> list[dict[str, Any]]:
     """Most seconds of the import, and of making a compiled solver with its first call."""
     what = "`import kornia_pnpnet` after torch and kornia"
@@ -103,7 +131,7 @@ def startup_targets(starts: Sequence[Row], imports: Sequence[float]) -> list[dic
     if any("compil" in text for entry in compiled for text in entry["warnings"]):
         return found  # there is no compiler
     for entry in sorted(compiled, key=lambda entry: (entry["backward"], entry["cache"] == CACHED)):
-        most, mode = 20.0 if entry["cache"] == COLD else 5.0, timing.BACKWARD if entry["backward"] else timing.FORWARD
+        most, mode = 20.0 if entry["cache"] == COLD else 5.0, BACKWARD if entry["backward"] else FORWARD
         what, first = f"`{COMPILED}`, first call, {mode}, {entry['cache']}", entry["calls"][0]["first_s"]
         found.append(target(what, entry["make_s"] + first, most, unit="s"))
     return found
