@@ -73,12 +73,11 @@ def leaders(alone: Rows, many: Rows) -> list[str]:
     """For one problem and for batches, the fastest of ours and of the other libraries."""
     found = []
     for what, rows in (("One problem at a time", alone), ("Batches", many)):
+        us = {name: row["median_us"] for name, row in rows.items()}
         sides = [*filter(is_whole, rows)], [name for name in PEERS if name in rows]
         if all(sides):
-            best = (min(side, key=lambda name: rows[name]["median_us"]) for side in sides)
-            fast, slow = sorted(best, key=lambda name: rows[name]["median_us"])
-            times = rows[slow]["median_us"] / rows[fast]["median_us"]
-            found.append(f"{what}: `{fast}` is fastest, {times:.1f} times as fast as `{slow}`.")
+            fast, slow = sorted((min(side, key=us.__getitem__) for side in sides), key=us.__getitem__)
+            found.append(f"{what}: `{fast}` is fastest, {us[slow] / us[fast]:.1f} times as fast as `{slow}`.")
     return found
 
 
@@ -99,22 +98,22 @@ def gpu_section(results: Row | None) -> dict[str, Any] | None:
     part = results["throughput"]
     rows = [row for row in part["rows"] if "median_us" in row]
     loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
-    groups: dict[tuple[str, int, str], dict[int, Row]] = {}
+    groups: dict[tuple[str, int, str], list[Row]] = {}
     for row in rows:
         if "work" in row:
-            groups.setdefault((row["contender"], row["n"], row["mode"]), {})[row["batch"]] = row
-    lines = {}
-    for place, found in groups.items():
-        best = min(found.values(), key=lambda row: row["median_us"])
+            groups.setdefault((row["contender"], row["n"], row["mode"]), []).append(row)
+    lines = []
+    for group in groups.values():
+        best = min(group, key=lambda row: row["median_us"])
         faster = f"{loops[best['n']]['median_us'] / best['median_us']:.0f}"
-        lines[place] = {**best, "us": {batch: row["median_us"] for batch, row in found.items()}, "faster": faster}
+        lines.append({**best, "us": {row["batch"]: row["median_us"] for row in group}, "faster": faster})
     complete = [x for x in results["parity"]["rows"] if None not in (x.get("same_pose"), x.get("same_gradient"))]
     return {
         "made": part["environment"],
         "poselib_us": loops[N]["median_us"],
         "count": results["parity"]["settings"]["parity"],
         "batches": part["settings"]["batches"],
-        "throughput": lines.values(),
+        "throughput": lines,
         "graphs": results["graphs"]["rows"],
         "modes": results["graphs"]["settings"]["modes"],
         "waits": results["waits"]["rows"],
@@ -187,14 +186,11 @@ def plot_latency(path: Path, title: str, rows: Sequence[Row]) -> Path:
     looks = _looks(row["contender"] for row in rows)
     figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()
-    for name, look in looks.items():
-        for row in rows:
-            if row["contender"] != name:
-                continue
-            shares = np.linspace(0, 1, len(row["quantiles_us"]))
-            kept = shares <= _LAST_SHARE
-            x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
-            axes.plot(x, y, **look, markevery=max(1, len(x) // 5))
+    for name, row in sorted(matching(rows).items(), key=lambda x: list(looks).index(x[0])):
+        shares = np.linspace(0, 1, len(row["quantiles_us"]))
+        kept = shares <= _LAST_SHARE
+        x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
+        axes.plot(x, y, **looks[name], markevery=max(1, len(x) // 5))
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
     log_scale(axes, "x")
     figures.draw_legend(figure, looks)

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared import command, dlt, write
+from kornia.geometry import solve_pnp_dlt
+from shared import command, write
 from torch import Tensor
 
 from kornia_pnpnet import create_solver
@@ -43,8 +44,8 @@ def ours(name: str) -> Solve:
 
 def kornias_dlt(*inputs: Tensor) -> tuple[Pose, Tensor]:
     """Kornia's; what is not finite does not count."""
-    pose = dlt(*inputs)
-    return pose, pose.matrix.detach().isfinite().all(-1).all(-1)
+    found = solve_pnp_dlt(*inputs)
+    return Pose(found[..., :3], found[..., 3]), found.detach().isfinite().all(-1).all(-1)
 
 
 SOLVERS: dict[str, Solve] = {"pnpnet-set": ours("pnpnet-set"), "epnp": ours("epnp"), "kornia-dlt": kornias_dlt}

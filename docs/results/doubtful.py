@@ -1,6 +1,6 @@
 """Problems that a solver must not believe, and small or flat objects that it must believe where it is right.
 
-:func:`doubtful` draws one batch of every kind. ``measure_probability.py`` measures ``ok`` on them, and
+:func:`doubtful` draws one batch of every kind. ``measure_judge.py`` measures ``ok`` on them, and
 ``tests/test_judge.py`` tests it.
 """
 

@@ -14,6 +14,7 @@ import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
+from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -240,16 +241,14 @@ def pooled(table: pd.DataFrame) -> pd.DataFrame:
 
 def in_words(table: pd.DataFrame) -> str:
     """The limits of a success, and the numbers of problems."""
+
+    def span(values: Iterable[float], form: str) -> str:
+        return " to ".join(dict.fromkeys(f"{x:{form}}" for x in (min(values), max(values))))
+
     limits = pd.DataFrame(list(table.limit), columns=["degrees", "length", "unit"]).replace("", "world units")
-    lengths = [f"{_span(part.length, '.2g')} {unit}" for unit, part in limits.groupby("unit", sort=False)]
-    problems = f"{_span(table.total, 'd')} problems in each set, 95 % intervals."
-    return f"Solved: errors below {_span(limits.degrees, 'g')}° and {' or '.join(lengths)}. {problems}"
-
-
-def _span(values: Iterable[float], form: str) -> str:
-    """The value, or the least and the largest value when their texts differ."""
-    low, high = f"{min(values):{form}}", f"{max(values):{form}}"
-    return low if low == high else f"{low} to {high}"
+    lengths = [f"{span(part.length, '.2g')} {unit}" for unit, part in limits.groupby("unit", sort=False)]
+    problems = f"{span(table.total, 'd')} problems in each set, 95 % intervals."
+    return f"Solved: errors below {span(limits.degrees, 'g')}° and {' or '.join(lengths)}. {problems}"
 
 
 def outliers_in_words(outliers: int | str, n: int | str = "n") -> str:
@@ -334,8 +333,7 @@ def mismatches(records: pd.DataFrame) -> Content:
 def against_n(records: pd.DataFrame) -> Content:
     """Success on the protocol's data against the number of pairs, a panel for each outlier setting.
 
-    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve.
-    Other solvers have a curve when they were measured at two n or more.
+    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Others need two n for a curve.
     """
     table = records.query("source == 'paper' and not swept and not mismatches")
     table = table[table.groupby("outliers").n.transform("nunique") > 1]
@@ -383,10 +381,9 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
         "success_against_m": against_m(records),
     }.items():
         if content.panels:
+            draw: Any = partial(draw_curves, x=content.x) if content.x else draw_dots
             path, heading = Path(folder) / f"{name}.png", [content.title, in_words(content.table)]
-            made.append(
-                draw_curves(path, heading, *content[2:]) if content.x else draw_dots(path, heading, content.panels)
-            )
+            made.append(draw(path, heading, content.panels))
     if not made:
         raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
     return made
@@ -530,15 +527,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("files", metavar="FILE", nargs="+", type=Path, help="results (JSON) or a sweep's summary.csv")
     parser.add_argument("--out", metavar="FOLDER", default="outputs/figures", help="default: outputs/figures")
     arguments = parser.parse_args(argv)
+    for path in (path for path in arguments.files if path.suffix == ".csv"):
+        numbers = read_sweep(path)[2]
+        if not numbers:
+            parser.error(f"{path}: no override differs between runs and is a number in all of them.")
+        for name in numbers:
+            print(plot_sweep(Path(arguments.out) / f"sweep_against_{short_name(name)}.png", path, against=name))
     results = []
-    for path in arguments.files:
-        if path.suffix == ".csv":
-            numbers = read_sweep(path)[2]
-            if not numbers:
-                parser.error(f"{path}: no override differs between runs and is a number in all of them.")
-            for name in numbers:
-                print(plot_sweep(Path(arguments.out) / f"sweep_against_{short_name(name)}.png", path, against=name))
-            continue
+    for path in (path for path in arguments.files if path.suffix != ".csv"):
         content = json.loads(path.read_text(encoding="utf-8"))
         counts = isinstance(content, dict) and content.get("kind") == "complexity"
         results.append(content if counts else load_results(path))

@@ -12,7 +12,7 @@ import pandas as pd
 import torch
 from figures import find_rows
 from measure import ANY, HERE
-from short_runs import read_summary
+from rates import read_summary
 
 from kornia_pnpnet.metrics import SuccessRate, success_rate
 

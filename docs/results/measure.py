@@ -275,10 +275,8 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     sets |= evaluation_sets(["any_rotation"], "uniform", n=9, **common)
     sets |= evaluation_sets(["synthetic"], "50%", n=50, **common)
     diagrams = {}
-    for name, entry in sets.items():
-        problems = entry.problems
-        guess = solver.with_starts(*problems[:3])[1]
-        found = reliability(guess.weights, problems.inliers)
+    for name, (problems, *_) in sets.items():
+        found = reliability(solver.with_starts(*problems[:3])[1].weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}
 
@@ -335,14 +333,12 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
     for names, step in STEPS:
         if wanted & names:
             step(Counts(scenes, synthetic_count, real_count), wanted & names)
+    if wanted & {"probability", "judge"}:
+        import measure_judge  # needs hydra
     if "probability" in wanted:
-        from measure_probability import measure_probability  # needs hydra
-
-        write_json(HERE / "probability.json", measure_probability(SEED_TUNE, SEED_REPORT + 60))
+        write_json(HERE / "probability.json", measure_judge.measure_probability(SEED_TUNE, SEED_REPORT + 60))
     if "judge" in wanted:
-        from measure_judge import measure_judge
-
-        write_json(HERE / "judge.json", measure_judge(scenes, SEED_REPORT + 70))
+        write_json(HERE / "judge.json", measure_judge.measure_judge(scenes, SEED_REPORT + 70))
     if "complexity" in wanted:
         write_json(HERE / "complexity.json", complexity_results())
 
