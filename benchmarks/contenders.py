@@ -1,4 +1,4 @@
-"""The contenders by name: solvers of this package and of other libraries; how much is measured, on which problems.
+"""The contenders by name: solvers of this package and of other libraries; the problems that they solve.
 
 A contender makes a task of a batch of problems. A task can be timed, forward or forward and backward, and counts how
 many problems its poses solve.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -352,40 +352,19 @@ CONTENDERS: dict[str, Callable[..., Contender]] = {
 }
 
 
-def make_contenders(settings: Settings) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
-    """The contenders that are asked for by name, and for each that cannot be made its name and the reason."""
+def make_contenders(names: Collection[str] | None) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
+    """Contenders by name (``None``: all), and for each that cannot be made its name and the reason."""
     made: dict[str, Contender] = {}
     skipped: list[dict[str, Any]] = []
     for name, make in CONTENDERS.items():
-        if settings.contenders is None or name in settings.contenders:
-            try:
-                made[name] = make()
-            except (ImportError, CannotBeTimedError) as error:
-                skipped.append({"contender": name, "why": str(error)})
-                say(f"skipped: {name}: {error}")
+        if names and name not in names:
+            continue
+        try:
+            made[name] = make()
+        except (ImportError, CannotBeTimedError) as error:
+            skipped.append({"contender": name, "why": str(error)})
+            say(f"skipped: {name}: {error}")
     return made, skipped
-
-
-class Settings(NamedTuple):
-    """How much is measured."""
-
-    contenders: tuple[str, ...] | None = None  # names; None: all
-    problems: int = 1000  # that success is counted on; batch size of the rows with other numbers of pairs than N
-    batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)  # at N pairs
-    pairs: tuple[int, ...] = (6, 9, 20, 100, 1000)
-    most_backward: int = 10_000  # largest batch size with gradients
-    rounds: int = 5  # at most
-    loop_s: float = 0.2  # for a contender in a round: a loop solves fewer problems, a shorter call is repeated
-    call_s: float = 2.0  # batches whose call takes longer are left out
-    point_s: float = 3.0  # for all rounds of one comparison, about
-    latency_calls: int = 1000  # calls with a single problem
-    latency_s: float = 2.5  # for these calls; slow contenders get fewer
-    memory_batch: int = 10_000  # of the memory measurement
-
-
-FULL = Settings()
-#: A few small problems, which show that everything runs.
-QUICK = Settings(None, 20, (1, 20), (6, 9), 20, 3, 0.01, 600.0, 1.0, 20, 1.0, 100)
 
 
 def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:

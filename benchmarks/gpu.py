@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 import contenders
 import torch
 from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw
-from harness import HERE, in_turns, parser, say, share, summary
-from timing import BACKWARD, FORWARD
+from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, share, summary
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry

@@ -26,6 +26,8 @@ from kornia_pnpnet.core.performance import keep_freed_memory
 from kornia_pnpnet.core.tables import markdown_table
 
 HERE = Path(__file__).resolve().parent
+#: What a call does.
+FORWARD, BACKWARD = "forward", "forward+backward"
 
 Row = Mapping[str, Any]
 

@@ -12,8 +12,7 @@ import harness
 import numpy as np
 import pandas as pd
 from contenders import ANY, COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS, PLAIN, TRAINED, N
-from harness import HERE, Row
-from timing import BACKWARD, FORWARD
+from harness import BACKWARD, FORWARD, HERE, Row
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import atomic_open
