@@ -4,8 +4,6 @@ A contender makes a task of a batch of problems. A task can be timed, forward or
 many problems its poses solve.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Collection, Sequence

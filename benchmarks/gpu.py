@@ -3,8 +3,6 @@
 README.md beside this file describes the measurements.
 """
 
-from __future__ import annotations
-
 import gc
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What the benchmarks share: threads, timing in turns, processes of their own, results files and tables."""
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

@@ -1,7 +1,5 @@
 """``docs/performance.md`` and its pictures, from ``performance.md.jinja`` and the results files."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence

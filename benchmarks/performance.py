@@ -4,8 +4,6 @@
 pictures from these files. README.md beside this file describes the measurements.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -14,8 +14,6 @@ reference pose, and of these the three with the most. ``--batch`` gives the numb
 ``cost`` times solvers by share of outliers and number of pairs.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import math
@@ -177,9 +175,9 @@ def agree(first: View, second: View, pairs: Whole) -> NDArray[np.bool_]:
     fundamental = epipolar.fundamental_from_projections(
         *(torch.from_numpy(view.intrinsics @ view.pose)[None] for view in views)
     )
-    points = [torch.from_numpy(view.pixels[at])[None] for view, at in zip(views, pairs.T, strict=True)]
-    right = epipolar.left_to_right_epipolar_distance(*points, fundamental)
-    left = epipolar.right_to_left_epipolar_distance(*points, fundamental)
+    one, two = (torch.from_numpy(view.pixels[at])[None] for view, at in zip(views, pairs.T, strict=True))
+    right = epipolar.left_to_right_epipolar_distance(one, two, fundamental)
+    left = epipolar.right_to_left_epipolar_distance(one, two, fundamental)
     return ((right < EPIPOLAR_PX) & (left < EPIPOLAR_PX))[0].numpy()
 
 

@@ -6,8 +6,6 @@ is killed, and a run that is killed as a whole and repeated. Compares the result
 problem. Writes ``scale.json``.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

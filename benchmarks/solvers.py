@@ -4,8 +4,6 @@ All solvers solve the same problems of the protocol's data in the same run, on o
 describes the measurements.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

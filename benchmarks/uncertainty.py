@@ -5,8 +5,6 @@
 The page says what is measured.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

@@ -5,8 +5,6 @@ number of another corner, as happens when markers are misread. `pnpnet-set` and 
 from the same corners. Writes `fiducial_board.json` and `fiducial_board.png` to `--out`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -6,8 +6,6 @@ through a differentiable solver: this package's `pnpnet-set`, its EPnP without w
 error of the offsets after every step. Writes `keypoint_offsets.json` and a picture of it to `--out`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

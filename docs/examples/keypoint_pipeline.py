@@ -14,8 +14,6 @@ keypoint as a standard deviation, as a covariance, or as a factor of the covaria
 `keypoint_covariances.json` to `--out`.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import multiprocessing
@@ -23,7 +21,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from kornia.filters import gaussian_blur2d, motion_blur
@@ -165,7 +163,7 @@ class Keypoints(nn.Module):
         self.noise = SIGMA
         self.to(memory_format=torch.channels_last)  # faster on CPUs
 
-    def predict(self, noise: str) -> Keypoints:
+    def predict(self, noise: str) -> Self:
         """Predict another kind of noise from now on; covariances begin as multiples of the identity."""
         self.noise = noise
         if noise == COVARIANCE:

@@ -11,8 +11,6 @@ DISK and LightGlue, whose weights Kornia downloads unless they are in the cache 
 ``localiser.json`` with all errors, and the picture ``localiser.png``. ``localise_photo.py`` is the same in short.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ The world is in metres, its z axis points up. A pose is world-to-camera, pixels 
 pixel is (0.5, 0.5)).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the examples share: command lines, results files, and errors of poses."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -9,8 +9,6 @@ Without ``--sequence`` a walk through a hall is rendered first (``rendered_hall.
 ``tracking.png``.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import tempfile

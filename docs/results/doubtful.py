@@ -4,8 +4,6 @@
 ``tests/test_judge.py`` tests it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ figure for which the files hold data is drawn. Each function writes the picture 
 and returns the path.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """The page on real matches and the overview of the home page, from what ``benchmarks/real_matches.py`` wrote."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Measure the results files of the page, put trained weights into the package. ``make.py`` is the command."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise, product
@@ -275,7 +273,8 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     sets |= evaluation_sets(["any_rotation"], "uniform", n=9, **common)
     sets |= evaluation_sets(["synthetic"], "50%", n=50, **common)
     diagrams = {}
-    for name, (problems, *_) in sets.items():
+    for name, entry in sets.items():
+        problems = entry.problems
         found = reliability(solver.with_starts(*problems[:3])[1].weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}

@@ -4,12 +4,10 @@ See ``kornia_pnpnet.judge.belief``. The coefficients go from ``probability.json`
 them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 from unittest import mock
 
 import numpy as np
@@ -48,24 +46,21 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
     of ``doubtful.py``. Returns the law, and by solver and kind the share of right and of far-off poses that are ``ok``,
     and the reliability.
     """
-    law = fit_law([solved(name, kind) for name in FITTED for kind in kinds(seed_fit) if in_fit(kind)])
+    law = fit_law([solved(name, kind) for name in FITTED for kind in kinds(seed_fit) if in_fit(kind.name)])
     made: dict[str, Any] = {"environment": environment(), "law": law}
     with mock.patch.object(belief, "LAW", law):
         for name in (*FITTED, *MEASURED):
-            rows = {kind.name: (in_fit(kind), solved(name, kind)) for kind in kinds(seed_report)}
-            fitted = [row for used, row in rows.values() if used]
+            rows = {kind.name: solved(name, kind) for kind in kinds(seed_report)}
+            fitted = [row for kind, row in rows.items() if in_fit(kind)]
             chance, near = (torch.cat([row[key] for row in fitted]) for key in ("probability", "near"))
-            curve = reliability(chance, near)._asdict()
-            made[name] = {
-                "kinds": {kind: rates(row) for kind, (_, row) in rows.items()},
-                "reliability": {key: values.nan_to_num(0.0).tolist() for key, values in curve.items()},
-            }
+            curve = {key: x.nan_to_num(0.0).tolist() for key, x in reliability(chance, near)._asdict().items()}
+            made[name] = {"kinds": {kind: rates(row) for kind, row in rows.items()}, "reliability": curve}
     return made
 
 
-def in_fit(kind: Drawn) -> bool:
-    """Whether a kind belongs to the fit."""
-    return not any(x in kind.name for x in LEFT_OUT)
+def in_fit(kind: str) -> bool:
+    """Whether a kind of problems belongs to the fit."""
+    return not any(x in kind for x in LEFT_OUT)
 
 
 class Drawn(NamedTuple):
@@ -77,7 +72,7 @@ class Drawn(NamedTuple):
     distance: Tensor
 
     @classmethod
-    def of(cls, name: str, problems: Problems) -> Drawn:
+    def of(cls, name: str, problems: Problems) -> Self:
         """Problems of a source."""
         inputs = dict(zip(ARGUMENTS, problems[:3], strict=True))
         return cls(name, inputs, problems.pose, problems.true_cam_points[..., 2].median(1).values)

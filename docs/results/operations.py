@@ -9,8 +9,6 @@ Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network
 Lightspeed toolbox.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -113,11 +111,11 @@ _REDUCTIONS = {
 }
 # Cost for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., float]] = {
-    **dict.fromkeys(("mm", "bmm"), lambda a, b: matmul(*a, b[1])),
+    **dict.fromkeys(("mm", "bmm"), lambda a, b: matmul(a[0], a[1], b[1])),
     **dict.fromkeys(
         ("addmm", "baddbmm"), lambda _, first, second: matmul(*first, second[1]) + first[0] * second[1] * ADD
     ),
-    "mv": lambda a, _: matmul(*a, 1),
+    "mv": lambda a, _: matmul(a[0], a[1], 1),
     "linalg_cholesky_ex": lambda matrix: cholesky(matrix[0]),
     "linalg_inv_ex": lambda matrix: solve(matrix[0], matrix[0]),
     "_linalg_solve_ex": lambda matrix, right: solve(matrix[0], right[1]),

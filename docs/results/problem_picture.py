@@ -1,7 +1,5 @@
 """The picture of the home page: a synthetic house, the pairs that ``pnpnet-set`` rejects, and the pose it finds."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Success rates of results files and of short training runs (ablations, the sweep, the size of the set network)."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence

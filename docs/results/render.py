@@ -1,7 +1,5 @@
 """Write the results pages, the overviews and their pictures from the results files. ``make.py`` is the command."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
