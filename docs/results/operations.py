@@ -112,9 +112,7 @@ _REDUCTIONS = {
 # Cost for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., float]] = {
     **dict.fromkeys(("mm", "bmm"), lambda a, b: matmul(a[0], a[1], b[1])),
-    **dict.fromkeys(
-        ("addmm", "baddbmm"), lambda _, first, second: matmul(*first, second[1]) + first[0] * second[1] * ADD
-    ),
+    **dict.fromkeys(("addmm", "baddbmm"), lambda _, a, b: matmul(a[0], a[1], b[1]) + a[0] * b[1] * ADD),
     "mv": lambda a, _: matmul(a[0], a[1], 1),
     "linalg_cholesky_ex": lambda matrix: cholesky(matrix[0]),
     "linalg_inv_ex": lambda matrix: solve(matrix[0], matrix[0]),
