@@ -70,18 +70,9 @@ class Amount(NamedTuple):
 FULL = Amount()
 #: A few small problems without compiling, which show that everything runs.
 QUICK = Amount(
-    parity=4,
-    graphs=("pnpnet-n9",),
-    modes=("eager",),
-    calls=(1, 4),
-    waits=(),
-    contenders=("pnpnet-n9", "epnp-lm"),
-    batches=(4, 8),
-    pairs=(9, 12),
-    rounds=3,
-    copied=2**16,
-    side=64,
+    parity=4, graphs=("pnpnet-n9",), modes=("eager",), calls=(1, 4), waits=(), rounds=3, copied=2**16, side=64
 )
+QUICK = QUICK._replace(contenders=("pnpnet-n9", "epnp-lm"), batches=(4, 8), pairs=(9, 12))
 
 
 def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -192,7 +183,7 @@ def _modes(
     for mode, solver in solvers.items():
         call = call_of(solver, problems, device, direction)
         try:
-            task = _task(captured(call) if mode == "captured" else call, problems, device)
+            task = Task(captured(call) if mode == "captured" else call, lambda: problems.pose, problems, device)
             start = time.perf_counter()
             task.warm()
             rotation, _, ok, slope = (x.clone() for x in task.call())  # the next replay overwrites its result
@@ -270,32 +261,22 @@ class Work(TorchDispatchMode):
             written = list(iter_tensors(result))
             product = flop_registry.get(func.overloadpacket)
             self.flops += product(*args, **kwargs, out_val=result) if product else sum(x.numel() for x in written)
-            self.bytes += size_bytes((args, *kwargs.values(), written))
+            self.bytes += sum(x.nbytes for x in iter_tensors((args, *kwargs.values(), written)))
         return result
-
-
-def size_bytes(tree: object) -> int:
-    """Bytes of the tensors of nested tuples."""
-    return sum(x.numel() * x.element_size() for x in iter_tensors(tree))
 
 
 def machine_rates(device: str, amount: Amount) -> dict[str, float]:
     """Bytes per second of a copy, read and written, and operations per second of a product of float32 matrices."""
     source = torch.zeros(amount.copied, device=device)
     target, matrix = torch.empty_like(source), torch.ones(amount.side, amount.side, device=device)
-    problems = draw(N, 1)  # a task has problems; these are not solved
+    problems = draw(N, 1)  # of the tasks; not solved
 
     def quickest(call: Callable[[], object]) -> float:
-        task = _task(call, problems, device)
+        task = Task(call, lambda: problems.pose, problems, device)
         return min(task.seconds() for _ in range(10))
 
     copy, product = quickest(lambda: target.copy_(source)), quickest(lambda: matrix @ matrix)
-    return {"bytes_per_s": 2 * size_bytes(source) / copy, "flops_per_s": 2 * amount.side**3 / product}
-
-
-def _task(call: Callable[[], object], problems: Problems, device: str) -> Task:
-    """A task whose poses nobody asks for."""
-    return Task(call, lambda: problems.pose, problems, device)
+    return {"bytes_per_s": 2 * source.nbytes / copy, "flops_per_s": 2 * amount.side**3 / product}
 
 
 def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[str, float]:
@@ -303,14 +284,13 @@ def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[st
     task = contender.task(problems, backward=backward)
     with Work() as counted:
         task.call()
-    points, pixels, pose = problems.world_points, problems.img_points, problems.pose
-    moved = [*(2 if backward else 1) * [points, pixels], problems.intrinsics, *pose]
-    count = len(points)
-    return {
-        "least_bytes": sum(4 * x.numel() for x in moved) / count,  # float32
-        "bytes": counted.bytes / count,
-        "flops": counted.flops / count,
-    }
+    moved = [*(2 if backward else 1) * problems[:2], problems.intrinsics, *problems.pose]
+    total = {
+        "least_bytes": sum(4 * x.numel() for x in moved),
+        "bytes": counted.bytes,
+        "flops": counted.flops,
+    }  # float32
+    return {key: value / task.size for key, value in total.items()}
 
 
 def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -365,12 +345,11 @@ def _expected_s(known: list[tuple[int, float]], batch: int) -> float:
 
 
 def _looped(name: str, n: int, amount: Amount) -> dict[str, Any]:
-    batch = amount.batches[0]
     say(f"throughput: {name}, n = {n}")
-    task = contenders.CONTENDERS[name]().task(draw(n, batch))
+    task = contenders.CONTENDERS[name]().task(draw(n, amount.batches[0]))
     task.warm()
-    times = summary([task.us() for _ in range(amount.rounds)])
-    return {"contender": name, "mode": FORWARD, "n": n, "batch": batch, "success": task.success().rate, **times}
+    place = {"contender": name, "mode": FORWARD, "n": n, "batch": task.size, "success": task.success().rate}
+    return {**place, **summary([task.us() for _ in range(amount.rounds)])}
 
 
 def peak_bytes(task: Task, device: str) -> int | None:

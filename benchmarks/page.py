@@ -13,7 +13,6 @@ from contenders import ANY, COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS, PLAIN, T
 from harness import BACKWARD, FORWARD, HERE, Row
 
 from kornia_pnpnet import PnPNet
-from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.evaluation.plots import WIDTH, log_scale, make_figure, save, themed
 from kornia_pnpnet.metrics import SuccessRate
 
@@ -24,10 +23,9 @@ PAGE = HERE.parent / "docs" / "performance.md"
 PARTS = ("throughput", "latency", "startup")
 #: Caches of the compiler at a start, or no compiler.
 COLD, CACHED, EAGER = "cold", "cached", "eager"
-#: Contenders that the pictures also show.
-DRAWN = ("p3p-ransac", "kornia-dlt")
-#: Other libraries.
+#: Other libraries, and what the pictures show besides the solvers of ours that users call.
 PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
+DRAWN = (*PEERS, "p3p-ransac", "kornia-dlt")
 
 Rows = Mapping[str, Row]  # by contender
 
@@ -208,22 +206,23 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def is_drawn(row: Row) -> bool:
-    """Whether the pictures show a row: solvers of ours that users call, and other libraries, on one thread."""
-    return row["threads"] == 1 and (is_whole(row["contender"]) or row["contender"] in (*PEERS, *DRAWN))
-
-
 def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """The results files, and the results file of a GPU when there is one."""
-    results = {part: json.loads((folder / f"{part}.json").read_text(encoding="utf-8")) for part in PARTS}
-    gpu = folder / "gpu.json"
-    return results, json.loads(gpu.read_text(encoding="utf-8")) if gpu.exists() else None
+    found = {path.stem: json.loads(path.read_bytes()) for path in folder.glob("*.json") if path.stem in (*PARTS, "gpu")}
+    return {part: found[part] for part in PARTS}, found.get("gpu")
 
 
 def render(folder: Path, path: Path) -> None:
     """Write the page and its pictures from the results files of a folder."""
     results, gpu = load_parts(folder)
-    rows = [row for row in results["throughput"]["rows"] if is_drawn(row)]
+    rows, alone = (
+        [
+            x
+            for x in results[part]["rows"]
+            if x["threads"] == 1 and (is_whole(x["contender"]) or x["contender"] in DRAWN)
+        ]
+        for part in ("throughput", "latency")
+    )
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
     batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
     pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != N)]
@@ -231,7 +230,5 @@ def render(folder: Path, path: Path) -> None:
     fewer = "".join(f" ({b} at n = {n})" for n, b in sorted({(x["n"], x["batch"]) for x in pairs}) if b < size)
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
     plot_times(pictures / "pairs.png", title, {FORWARD: pairs}, against="n", label="pairs n")
-    alone = [row for row in results["latency"]["rows"] if is_drawn(row)]
     plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 outliers, one thread", alone)
-    with atomic_open(path, encoding="utf-8") as file:
-        file.write(page(results, gpu))
+    path.write_text(page(results, gpu), encoding="utf-8")

@@ -48,10 +48,9 @@ SIZES, SHARES = (10, 30, 50, 110), (0.0, 0.3, 0.5)
 THRESHOLD = 20.0
 #: Solvers of other libraries. The first two take no outliers.
 PEERS: dict[str, Callable[[], PeerSolver]] = {
-    "EPnP": lambda: OpenCVPnP(method="EPNP"),
-    "SQPnP": lambda: OpenCVPnP(method="SQPNP"),
-    "PoseLib": lambda: PoseLib(threshold=THRESHOLD),
+    name: partial(OpenCVPnP, method=name.upper()) for name in ("EPnP", "SQPnP")
 }
+PEERS["PoseLib"] = partial(PoseLib, threshold=THRESHOLD)
 #: For covariances of poses and for priors: number of pairs, and number of outliers among them.
 CREDIBLE = ((9, 0), (9, 2), (9, 4), (20, 0), (20, 10), (50, 0), (50, 25), (200, 0), (200, 100))
 FEW = ((3, 0), (4, 0), (4, 1), (5, 1), (6, 0), (6, 2), (9, 3), (12, 4))

@@ -27,9 +27,9 @@ def main() -> None:
     subprocess.run([sys.executable, str(TRAIN), "-m", *fixed, *overrides], check=True)
 
     table = pd.read_csv(folder / "summary.csv")  # overrides, then "update", speed, and the success on each set
-    names = [override.partition("=")[0] for override in overrides]
+    names = [override.lstrip("+").partition("=")[0] for override in overrides]
     rate, low, high = (f"{options.data}/{key}" for key in ("rate", "low", "high"))
-    table = table[table["train.updates"] == options.updates].sort_values(rate, ascending=False)
+    table = table[table["train.updates"] == options.updates].dropna(subset=names).sort_values(rate, ascending=False)
     print(table[[*names, "us_per_problem", rate, low, high]].to_string(index=False))
     best, *others = table.to_dict("records")
     near = [x for x in others if x[high] >= best[low]]
