@@ -268,15 +268,6 @@ def _by_outliers(table: pd.DataFrame, n: int | str) -> list[Panel]:
     return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
 
 
-def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
-    """Draw operation counts without and with RANSAC, see ``operations.complexity_results``: figure 1."""
-    counts = {"n": complexity["n"], **complexity["counts"]}
-    table = pd.DataFrame(counts).melt("n", var_name="solver", value_name="operations")
-    sampled = table.solver.isin(complexity["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
-    panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
-    return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
-
-
 class Content(NamedTuple):
     """What a figure shows: panels of curves against the column ``x``, or of dots. ``table`` has all rows."""
 
@@ -369,7 +360,14 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
     if len(complexity) > 1:
         raise ValueError(f"Expected at most one file of operation counts, got {len(complexity)}.")
     records = read_records(entry for entry in results if entry.get("kind") != "complexity")
-    made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
+    made = []
+    for entry in complexity:  # see `operations.complexity_results`
+        counts = pd.DataFrame({"n": entry["n"], **entry["counts"]})
+        table = counts.melt("n", var_name="solver", value_name="operations")
+        sampled = table.solver.isin(entry["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
+        panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
+        heading = ["Operations that a problem of n pairs takes"]
+        made.append(draw_curves(Path(folder) / "figure1_operations.png", heading, panels, "n"))
     for name, content in {
         "figure2_paper": synthetic(records, "paper"),
         "figure3_gaussian_pose": synthetic(records, "gaussian_pose"),

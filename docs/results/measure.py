@@ -110,8 +110,7 @@ class FromTheTruth(nn.Module):
 
     def __init__(self, solver: PnPNet) -> None:
         super().__init__()
-        self.config = solver.config()
-        self.solver = solver
+        self.config, self.solver = solver.config(), solver
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """Refine the true poses."""
@@ -130,11 +129,8 @@ def tune(data: Mapping[str, EvaluationData], label: str, names: Iterable[str] = 
         base, grid = TUNED[name]
         choices = product(*([f"{key}={x:g}" for x in values] for key, values in grid.items()))
         specs = [f"{base}{',' if ':' in base else ':'}{','.join(choice)}" for choice in choices]
-        results = evaluate(named(specs), data, path=OUTPUTS / "tuning" / f"{label}, {name}.json", repeats=1)
-        total = dict.fromkeys(specs, 0.0)
-        for row in results["rows"]:
-            total[row["solver"]] += row["success"]["rate"]
-        best[name] = max(total, key=lambda spec: total[spec])
+        rows = evaluate(named(specs), data, path=OUTPUTS / "tuning" / f"{label}, {name}.json", repeats=1)["rows"]
+        best[name] = max(specs, key=lambda x: sum(row["success"]["rate"] for row in rows if row["solver"] == x))
     return best
 
 
@@ -231,12 +227,13 @@ def measure_set(counts: Counts, wanted: set[str]) -> None:
 
 def tune_sigma(data: Mapping[str, EvaluationData]) -> float:
     """The standard deviation of the pixels with the highest success: to this solver what a threshold is to others."""
-    solved = dict.fromkeys(SIGMAS, 0.0)
-    for sigma in SIGMAS:
+
+    def solved(sigma: float) -> float:
         path = OUTPUTS / "tuning" / f"set, {sigma:g}.json"
         rows = evaluate(named((ANY,)), with_known_noise(data, sigma), path=path, repeats=1)["rows"]
-        solved[sigma] = sum(row["success"]["rate"] for row in rows)
-    return max(solved, key=lambda sigma: solved[sigma])
+        return sum(float(row["success"]["rate"]) for row in rows)
+
+    return max(SIGMAS, key=solved)
 
 
 def with_known_noise(sets: Mapping[str, EvaluationData], img_sigma: float) -> dict[str, EvaluationData]:
