@@ -14,6 +14,7 @@ DISK and LightGlue, whose weights Kornia downloads unless they are in the cache 
 import tempfile
 import time
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -228,13 +229,10 @@ def run(
     images: Path, model: pycolmap.Reconstruction, detector: Detector, *, batch: int, metre: float
 ) -> tuple[dict[str, Any], list[tuple[Matches, Tensor, dict[str, Any]]]]:
     """Localise the queries of a model; the results, and of each query its pairs, which of them count, and its row."""
-    seconds: dict[str, float] = {}
-    clock = time.process_time()
+    marks = [("start", time.process_time())]
 
     def lap(stage: str) -> None:
-        nonlocal clock
-        now = time.process_time()
-        seconds[stage], clock = now - clock, now
+        marks.append((stage, time.process_time()))
 
     posed = sorted((x for x in model.images.values() if x.has_pose), key=lambda x: x.name)
     pointed = [x for x in posed if x.num_points3D]
@@ -278,7 +276,7 @@ def run(
         row |= {"outliers": outlier.double().mean().item(), "outliers_of_all": of_all.double().mean().item()}
         rows.append(row | {name: of_queries[i] for name, of_queries in found.items()})
         drawn.append((kept[i], result.inliers[i, : len(outlier)], rows[-1]))
-    ms = {stage: 1000.0 * x / len(photos) for stage, x in seconds.items()}
+    ms = {stage: 1000.0 * (end - begin) / len(photos) for (_, begin), (stage, end) in pairwise(marks)}
     stages = {stage: ms[stage] for stage in ("features", "retrieval", "matching", "confidence")}
     solvers = {name: summary(x, ms[name]) for name, x in found.items()}
     settings = {"references": len(references), "matched_with": REFERENCES, "pairs": MOST_PAIRS, "batch": batch}

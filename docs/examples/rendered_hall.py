@@ -89,22 +89,17 @@ def make_hall(seed: int = 0) -> list[Plane]:
     return planes
 
 
-def look_at(centre: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """The pose of a level camera that looks from a place to a target: rotation (3, 3), translation (3,)."""
+def photograph(hall: list[Plane], centre: Floats, target: Floats) -> View:
+    """Render what a level camera sees from a place to a target by casting rays: image and smallest depths."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(DOWN, forward)
     right /= np.linalg.norm(right)
     rotation = np.stack((right, np.cross(forward, right), forward))
-    return rotation, -rotation @ centre
-
-
-def photograph(hall: list[Plane], rotation: Floats, translation: Floats) -> View:
-    """Render one image by casting rays, and the smallest depth in each pixel."""
+    translation = -rotation @ centre
     size = np.array([WIDTH, HEIGHT]) * SUPERSAMPLING
     columns, rows = np.meshgrid(*((np.arange(n) + 0.5) / SUPERSAMPLING for n in size))
     rays = np.stack((columns, rows, np.ones_like(rows)), -1) @ np.linalg.inv(INTRINSICS).T @ rotation  # depth 1
     rays = rays.astype(np.float32)
-    centre = -rotation.T @ translation
     nearest = np.full(rays.shape[:2], np.inf, np.float32)
     image = np.zeros(rays.shape[:2], np.uint8)
     for corner, along, up, texture in hall:
@@ -146,8 +141,7 @@ def reference_views(hall: list[Plane], count: int, seed: int = 1) -> list[View]:
         centre = SIZE * [0.5, 0.5, 0.0] + round_trip * [4.2, 3.0, 0.0] + [0.0, 0.0, rng.uniform(1.5, 2.0)]
         across = turn + math.pi + math.radians(50.0) * (-1.0) ** i
         target = centre + 4.0 * np.array([math.cos(across), math.sin(across), rng.uniform(-0.25, 0.0)])
-        view = photograph(hall, *look_at(centre, target))
-        views.append(expose(view, rng, blur=0.6, noise=2.0, gain=1.0))
+        views.append(expose(photograph(hall, centre, target), rng, blur=0.6, noise=2.0, gain=1.0))
     return views
 
 
@@ -158,7 +152,7 @@ def query_views(hall: list[Plane], count: int, seed: int = 2) -> Iterator[View]:
         centre = rng.uniform([1.0, 1.0, 1.4], [*(SIZE[:2] - 1.0), 2.2])
         turn = rng.uniform(0.0, 2.0 * math.pi)
         target = centre + 4.0 * np.array([math.cos(turn), math.sin(turn), rng.uniform(-0.35, 0.1)])
-        view = photograph(hall, *look_at(centre, target))
+        view = photograph(hall, centre, target)
         yield expose(view, rng, blur=rng.uniform(0.5, 2.5), noise=rng.uniform(2.0, 16.0), gain=rng.uniform(0.2, 1.0))
 
 
@@ -227,7 +221,7 @@ def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
         centre += 0.03 * np.sin(time * np.array([5.0, 7.0, 11.0]))
         ahead = turn + math.pi + 0.4 * math.sin(0.9 * time)
         target = centre + 4.0 * np.array([math.cos(ahead), math.sin(ahead), -0.1 + 0.03 * math.sin(9.0 * time)])
-        view = expose(photograph(hall, *look_at(centre, target)), rng, blur=1.0, noise=5.0, gain=0.8)
+        view = expose(photograph(hall, centre, target), rng, blur=1.0, noise=5.0, gain=0.8)
         near = np.where(view.depth < MAX_DEPTH, view.depth, 0.0)
         noise = depth_sigma(near) * rng.normal(size=near.shape)
         depth = np.where(near > 0, (near + noise) * 5000.0, 0.0).round().astype(np.uint16)

@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
-from itertools import cycle, pairwise
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -499,17 +499,14 @@ def plot_real_matches(
         for part, look in _RAW_LOOKS.items():
             style |= look if part in name else {}
     styles = {titles[solver]: looks[shown[solver]] for solver in solvers}
-    shares, pairs = (list(pairwise(costs["settings"][key])) for key in ("shares", "pairs"))
-    by_share = {f"{100 * a:.0f}–{100 * b:.0f} %": f"{100 * a:.0f}–{100 * b:.0f}" for a, b in shares}
-    by_pairs = {f"{a}–{b - 1} pairs": f"{a}–{b - 1}" for a, b in pairs}
     figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
-    plots = ("success", by_share, "outliers (%)"), ("ms", by_share, "outliers (%)"), ("ms", by_pairs, "pairs")
-    for axes, (value, groups, label) in zip(figure.subplots(1, 3), plots, strict=True):
-        there = [group for group in groups if (solvers[0], group) in times]
+    plots = ("success", " %", "outliers (%)"), ("ms", " %", "outliers (%)"), ("ms", " pairs", "pairs")
+    for axes, (value, unit, label) in zip(figure.subplots(1, 3), plots, strict=True):
+        there = [group for solver, group in times if solver == solvers[0] and group.endswith(unit)]
         for name in solvers:
             heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g in there]
             axes.plot(np.arange(len(there)), heights, **styles[titles[name]])
-        axes.set_xticks(range(len(there)), [groups[group] for group in there], rotation=40, ha="right")
+        axes.set_xticks(range(len(there)), [group.removesuffix(unit) for group in there], rotation=40, ha="right")
         axes.set(xlabel=label, title="solved (%)" if value == "success" else "ms per problem")
         if value == "ms":
             log_scale(axes, "y")
