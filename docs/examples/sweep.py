@@ -18,7 +18,7 @@ TRAIN = Path(__file__).resolve().parents[2] / "train.py"
 def main() -> None:
     parser = command(__doc__)
     parser.add_argument("overrides", nargs="*", help="default: model.m=2,5 optim.lr=1e-3,3e-3")
-    parser.add_argument("--updates", type=int, default=500, help="of each training; 500 take half a minute")
+    parser.add_argument("--updates", type=int, default=500, help="of each training; 500 take about a minute")
     parser.add_argument("--data", default="uniform", help="the validation set that compares")
     options = parser.parse_args()
     overrides = options.overrides or ["model.m=2,5", "optim.lr=1e-3,3e-3"]
