@@ -228,7 +228,7 @@ def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
         for kind, image in (("rgb", view.image), ("depth", depth)):
             cv2.imwrite(str(folder / kind / f"{i:04}.png"), image)
             lines[kind].append(f"{time:.4f} {kind}/{i:04}.png")
-        turn = pycolmap.Rotation3d(view.rotation.T).quat
+        turn = pycolmap.Rigid3d(np.column_stack((view.rotation.T, centre))).rotation.quat
         lines["groundtruth"].append(" ".join(map(str, (f"{time:.4f}", *centre, *turn))))
     for kind, rows in lines.items():
         (folder / f"{kind}.txt").write_text("\n".join(rows) + "\n")
