@@ -5,8 +5,6 @@
 The page says what is measured.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time
@@ -47,16 +45,15 @@ _OPEN = 1e3
 # Problems that the other libraries solve one by one: with 80 % outliers each takes 25 ms.
 FEW = 200
 THRESHOLD, RIG_THRESHOLD = 12.0, 10.0
-RIG_PEERS = ("PoseLib", "pycolmap")
 
 
 class Found(NamedTuple):
-    """What a solver found: poses, focal lengths, ``ok``, and µs per problem."""
+    """What a solver found."""
 
     pose: Pose
     focal: Tensor
     ok: Tensor
-    us: float
+    us: float  # per problem
 
 
 def first_focal(intrinsics: Tensor) -> Tensor:
@@ -88,22 +85,18 @@ def oracle(problems: Problems) -> Found:
     return Found(result.pose, result.intrinsics[:, 0, 0], result.ok, 0.0)
 
 
-def one_by_one(solve: Callable[..., tuple[np.ndarray, np.ndarray, float] | None], problems: Problems) -> Found:
-    """Call a function of world points, pixels, intrinsics and the index for each problem."""
-    nothing = np.eye(3), np.zeros(3), 1.0
+def one_by_one(solve: Callable[..., tuple[np.ndarray, float] | None], problems: Problems) -> Found:
+    """Call a function of world points, pixels, intrinsics and the index for each problem.
+
+    The function returns the pose (3, 4) and the focal length, or ``None``.
+    """
     arrays = [x.double().numpy() for x in problems[:3]]
     start = time.perf_counter()
     found = [solve(*inputs, i) for i, inputs in enumerate(zip(*arrays, strict=True))]
     us = 1e6 * (time.perf_counter() - start) / len(found)
-    columns = zip(*(x or nothing for x in found), strict=True)
-    rotation, translation, focal = (torch.from_numpy(np.array(x, dtype=np.float64)) for x in columns)
-    return Found(Pose(rotation, translation), focal, torch.tensor([x is not None for x in found]), us)
-
-
-def parts(pose: pycolmap.Rigid3d, focal: float = 1.0) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation, translation and focal length of a pose of pycolmap."""
-    matrix = pose.matrix()
-    return matrix[:, :3], matrix[:, 3], focal
+    columns = zip(*(x or (np.eye(3, 4), 1.0) for x in found), strict=True)
+    pose, focal = (torch.from_numpy(np.array(x, dtype=np.float64)) for x in columns)
+    return Found(Pose(pose[..., :3], pose[..., 3]), focal, torch.tensor([x is not None for x in found]), us)
 
 
 def colmap_focal(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: int) -> Any:
@@ -114,7 +107,7 @@ def colmap_focal(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: 
     estimation: Any = {"estimate_focal_length": True, "ransac": {"max_error": THRESHOLD, "random_seed": 0}}
     refinement: Any = {"refine_focal_length": True}
     found = pycolmap.estimate_and_refine_absolute_pose(img, world, camera, estimation, refinement)
-    return found and parts(found["cam_from_world"], float(found.get("camera", camera).params[0]))
+    return found and (found["cam_from_world"].matrix(), float(found.get("camera", camera).params[0]))
 
 
 def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: int) -> Any:
@@ -128,7 +121,7 @@ def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _:
         except cv2.error:
             continue
         if found and inliers is not None and len(inliers) > most:
-            most, best = len(inliers), (cv2.Rodrigues(rvec)[0], tvec[:, 0], focal)
+            most, best = len(inliers), (np.column_stack((cv2.Rodrigues(rvec)[0], tvec)), focal)
     return best
 
 
@@ -140,43 +133,41 @@ FOCAL_PEERS = {
 BY_FOCAL = (*OURS, *FOCAL_PEERS, "oracle")
 
 
-def rig_models(intrinsics: np.ndarray) -> list[dict[str, Any]]:
-    """Cameras of COLMAP's model PINHOLE."""
-    pinholes = ([k[0, 0], k[1, 1], k[0, 2], k[1, 2]] for k in intrinsics)
-    return [{"model": "PINHOLE", "width": 2000, "height": 2000, "params": params} for params in pinholes]
-
-
-def poselib_rig(problems: Problems, cameras: int) -> Found:
-    """PoseLib's generalised absolute pose."""
-    assert problems.cam_from_rig is not None
-    rotation, translation, matrices = (x.numpy() for x in (*problems.cam_from_rig, problems.intrinsics))
+def poselib_rig(world: np.ndarray, img: np.ndarray, models: list[dict[str, Any]], places: np.ndarray) -> Any:
+    """PoseLib's generalised absolute pose; the cameras, whose poses (C, 3, 4) are ``places``, have pairs in turn."""
     options = {"max_reproj_error": RIG_THRESHOLD, "min_iterations": 100, "max_iterations": 10_000}
-
-    def solve(world: np.ndarray, img: np.ndarray, _: np.ndarray, i: int) -> Any:
-        extrinsics = [poselib.CameraPose() for _ in range(cameras)]
-        for c, place in enumerate(extrinsics):
-            place.R, place.t = rotation[i, c], translation[i, c]
-        pairs = [[x[c::cameras] for c in range(cameras)] for x in (img, world)]
-        models = rig_models(matrices[i, :cameras])
-        pose, report = poselib.estimate_generalized_absolute_pose(*pairs, extrinsics, models, options, {})
-        return (pose.R, pose.t, 1.0) if report["num_inliers"] else None
-
-    return one_by_one(solve, problems)
+    cameras = len(places)
+    extrinsics = [poselib.CameraPose() for _ in places]
+    for camera, place in zip(extrinsics, places, strict=True):
+        camera.R, camera.t = place[:, :3], place[:, 3]
+    pairs = [[x[c::cameras] for c in range(cameras)] for x in (img, world)]
+    pose, report = poselib.estimate_generalized_absolute_pose(*pairs, extrinsics, models, options, {})
+    return (np.column_stack((pose.R, pose.t)), 1.0) if report["num_inliers"] else None
 
 
-def pycolmap_rig(problems: Problems, cameras: int) -> Found:
-    """Pycolmap's generalised absolute pose."""
+def pycolmap_rig(world: np.ndarray, img: np.ndarray, models: list[dict[str, Any]], places: np.ndarray) -> Any:
+    """Pycolmap's generalised absolute pose, see :func:`poselib_rig`."""
+    options: Any = {"max_error": RIG_THRESHOLD, "min_num_trials": 100, "random_seed": 0}
+    at = [*(np.arange(len(world)) % len(places))]
+    cameras, rigid = [pycolmap.Camera(**model) for model in models], [pycolmap.Rigid3d(x) for x in places]
+    found = pycolmap.estimate_and_refine_generalized_absolute_pose(img, world, at, rigid, cameras, options)
+    return found and (found["rig_from_world"].matrix(), 1.0)
+
+
+#: Solvers of other libraries for rigs.
+RIG_PEERS = {"PoseLib": poselib_rig, "pycolmap": pycolmap_rig}
+
+
+def rig_peer(estimate: Callable[..., Any], problems: Problems, cameras: int) -> Found:
+    """Solve rigs with one of ``RIG_PEERS``, one by one; the cameras have COLMAP's model PINHOLE."""
     assert problems.cam_from_rig is not None
     rotation, translation = problems.cam_from_rig
-    matrices, places = problems.intrinsics.numpy(), torch.cat((rotation, translation[..., None]), -1).numpy()
-    options: Any = {"max_error": RIG_THRESHOLD, "min_num_trials": 100, "random_seed": 0}
+    places, matrices = torch.cat((rotation, translation[..., None]), -1).numpy(), problems.intrinsics.numpy()
 
     def solve(world: np.ndarray, img: np.ndarray, _: np.ndarray, i: int) -> Any:
-        models = [pycolmap.Camera(**model) for model in rig_models(matrices[i, :cameras])]
-        rigid = [pycolmap.Rigid3d(x) for x in places[i, :cameras]]
-        at = [*(np.arange(len(world)) % cameras)]
-        found = pycolmap.estimate_and_refine_generalized_absolute_pose(img, world, at, rigid, models, options)
-        return found and parts(found["rig_from_world"])
+        pinholes = ([k[0, 0], k[1, 1], k[0, 2], k[1, 2]] for k in matrices[i, :cameras])
+        models = [{"model": "PINHOLE", "width": 2000, "height": 2000, "params": params} for params in pinholes]
+        return estimate(world, img, models, places[i, :cameras])
 
     return one_by_one(solve, problems)
 
@@ -278,7 +269,7 @@ def measure_rigs(count: int, sets: Sequence[tuple[int, float]] = RIG_SETS) -> li
         problems = random_cameras(n, count, SEED + 200 + k, outliers, **shape)
         few = take(problems, slice(FEW))
         found = {name: (ours(solver, problems, known=True), problems) for name, solver in solvers.items()}
-        found |= {"PoseLib": (poselib_rig(few, cameras), few), "pycolmap": (pycolmap_rig(few, cameras), few)}
+        found |= {name: (rig_peer(estimate, few, cameras), few) for name, estimate in RIG_PEERS.items()}
         place = {"cameras": cameras, "baseline": baseline, "n": n, "share": outliers}
         rows += [{**place, "solver": name, **row(*one, focal=math.inf)} for name, one in found.items()]
     return rows

@@ -1,15 +1,12 @@
-"""The contenders by name: solvers of this package and of other libraries; how much is measured, on which problems.
+"""The contenders by name: solvers of this package and of other libraries; the problems that they solve.
 
 A contender makes a task of a batch of problems. A task can be timed, forward or forward and backward, and counts how
 many problems its poses solve.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +21,7 @@ from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, Starts, pose_erro
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
+from kornia_pnpnet.evaluation.results import source_digest
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.result import Pose, Problems
@@ -49,21 +47,18 @@ class CannotBeTimedError(Exception):
     """Why a contender cannot be timed."""
 
 
-@dataclass
-class Task:
-    """A call on given problems.
+class Task(NamedTuple):
+    """A call on given problems."""
 
-    Attributes:
-        call: solves all problems once, forward, or forward and backward.
-        poses: returns the poses in the frame of the problems; not timed.
-        problems: the problems.
-        device: the device that works; a call on a GPU is timed until the GPU has finished.
-    """
-
-    call: Callable[[], Any]
-    poses: Callable[[], Pose]
+    call: Callable[[], Any]  # solves all problems once, forward, or forward and backward
+    poses: Callable[[], Pose]  # of all problems, in their frame; not timed
     problems: Problems
-    device: str = "cpu"
+    device: str = "cpu"  # a call on a GPU is timed until the GPU has finished
+
+    @property
+    def size(self) -> int:
+        """Number of problems."""
+        return len(self.problems.world_points)
 
     def seconds(self, times: int = 1) -> float:
         """Seconds of a call, the mean over ``times`` calls."""
@@ -77,6 +72,10 @@ class Task:
 
         torch.cuda.synchronize()
         return seconds(everything) / times
+
+    def us(self, times: int = 1) -> float:
+        """Microseconds per problem, the mean over ``times`` calls."""
+        return 1e6 * self.seconds(times) / self.size
 
     def warm(self) -> float:
         """Call twice, first to compile and to fill caches, and return the seconds of the second call.
@@ -111,7 +110,7 @@ def compile_or_raise(module: nn.Module, **options: bool | str) -> None:
 
 def gradient(pose: Pose, leaves: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Gradients of the sum of all entries of the poses."""
-    return torch.autograd.grad(pose.rotation.sum() + pose.translation.sum(), leaves, allow_unused=True)
+    return torch.autograd.grad(pose.rotation.sum() + pose.translation.sum(), leaves, materialize_grads=True)
 
 
 def float_inputs(problems: Problems, device: str = "cpu") -> list[Tensor]:
@@ -120,18 +119,11 @@ def float_inputs(problems: Problems, device: str = "cpu") -> list[Tensor]:
 
 
 class Contender:
-    """A solver to be timed. A subclass defines ``call``, and the other methods where they differ.
+    """A solver to be timed. A subclass defines ``call``, and the other methods where they differ."""
 
-    Attributes:
-        loops: whether problems are solved one after the other. Then a part of a batch shows the time per problem.
-        differentiable: whether there are gradients.
-        n: the only number of pairs that the solver takes, if there is one.
-        device: the device that works.
-    """
-
-    loops = False
-    differentiable = True
-    n: int | None = None
+    loops = False  # whether problems are solved one after the other: a part of a batch shows the time per problem
+    differentiable = True  # whether there are gradients
+    n: int | None = None  # the only number of pairs that the solver takes, if there is one
     device = "cpu"
 
     def takes(self, n: int) -> bool:
@@ -222,10 +214,10 @@ class Refinement(Ours):
         return Pose(*inputs[-1].undo(self.call(inputs).pose))
 
 
-def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
+def coarse_pose(problems: Problems) -> Pose:
     """The true poses, turned about the centre of the points and moved."""
     rotation, translation = problems.pose
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     turn, shift = torch.randn(2, len(rotation), 3, generator=generator, dtype=torch.float64)
     turn, shift = (x / x.norm(dim=-1, keepdim=True) for x in (turn, shift))
     centre = problems.world_points.mean(1)[..., None]  # (B, 3, 1)
@@ -235,29 +227,23 @@ def coarse_pose(problems: Problems, seed: int = 0) -> Pose:
     return Pose(turned, (cam_centre - turned @ centre)[..., 0] + shift)
 
 
-def exported(spec: str, suffix: str, export: Callable[[PnPNet, Path], object]) -> Path:
-    """Export a solver, unless ``outputs/exported`` has it from the present code: exporting takes minutes."""
-    from kornia_pnpnet.evaluation.results import source_digest
-
+def exported(spec: str, suffix: str, export: Callable[..., object]) -> Path:
+    """Export a solver for N pairs, unless ``outputs/exported`` has it from the present code: this takes minutes."""
     path = HERE.parent / "outputs" / "exported" / f"{spec}-{source_digest()[:16]}{suffix}"
     if not path.exists():
-        solver = load_solver(spec)
-        assert isinstance(solver, PnPNet)
-        export(solver, path)
+        export(load_solver(spec), path, N)
     return path
 
 
 class Packaged(Contender):
-    """A solver of this package for nine pairs, compiled ahead of time for one problem per call, in float32."""
+    """A solver of this package for N pairs, compiled ahead of time for one problem per call, in float32."""
 
-    loops, differentiable, n = True, False, 9
+    loops, differentiable, n = True, False, N
 
     def __init__(self, spec: str) -> None:
         from kornia_pnpnet.export import export_package, load_package
 
-        self.solver = load_package(
-            exported(spec, ".pt2", lambda solver, path: export_package(solver, path, 9, batch=1))
-        )
+        self.solver = load_package(exported(spec, ".pt2", partial(export_package, batch=1)))
 
     def inputs(self, problems: Problems) -> Any:
         """The inputs of each problem."""
@@ -273,16 +259,16 @@ class Packaged(Contender):
 
 
 class Onnx(Contender):
-    """A solver of this package as an ONNX model for nine pairs, under ONNX Runtime, in float32."""
+    """A solver of this package as an ONNX model for N pairs, under ONNX Runtime, in float32."""
 
-    differentiable, n = False, 9
+    differentiable, n = False, N
 
     def __init__(self, spec: str) -> None:
         import onnxruntime
 
         from kornia_pnpnet.export import export_onnx
 
-        path = exported(spec, ".onnx", lambda solver, path: export_onnx(solver, path, 9))
+        path = exported(spec, ".onnx", export_onnx)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = 3
@@ -320,17 +306,9 @@ class Peer(Contender):
     def __init__(self, spec: str) -> None:
         self.solver = load_solver(spec)
 
-    def inputs(self, problems: Problems) -> Any:
-        """The calls for all problems."""
-        return bare_call(self.solver, problems)
-
-    def call(self, inputs: Any) -> Any:
-        """Call the library for each problem."""
-        return inputs()
-
-    def poses(self, problems: Problems, inputs: Any) -> Pose:
-        """Solve with the adapter of this package."""
-        return Pose(*self.solver(*problems[:3]).pose)
+    def task(self, problems: Problems, *, backward: bool = False) -> Task:
+        """Call the library for each problem. The poses are those of the adapter of this package."""
+        return Task(bare_call(self.solver, problems), lambda: Pose(*self.solver(*problems[:3]).pose), problems)
 
 
 class KorniaDLT(Contender):
@@ -372,40 +350,19 @@ CONTENDERS: dict[str, Callable[..., Contender]] = {
 }
 
 
-def make_contenders(settings: Settings) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
-    """The contenders that are asked for by name, and for each that cannot be made its name and the reason."""
+def make_contenders(names: Collection[str] | None) -> tuple[dict[str, Contender], list[dict[str, Any]]]:
+    """Contenders by name (``None``: all), and for each that cannot be made its name and the reason."""
     made: dict[str, Contender] = {}
     skipped: list[dict[str, Any]] = []
     for name, make in CONTENDERS.items():
-        if settings.contenders is None or name in settings.contenders:
-            try:
-                made[name] = make()
-            except (ImportError, CannotBeTimedError) as error:
-                skipped.append({"contender": name, "why": str(error)})
-                say(f"skipped: {name}: {error}")
+        if names and name not in names:
+            continue
+        try:
+            made[name] = make()
+        except (ImportError, CannotBeTimedError) as error:
+            skipped.append({"contender": name, "why": str(error)})
+            say(f"skipped: {name}: {error}")
     return made, skipped
-
-
-class Settings(NamedTuple):
-    """How much is measured."""
-
-    contenders: tuple[str, ...] | None = None  # names; None: all
-    problems: int = 1000  # that success is counted on; batch size of the rows with other numbers of pairs than N
-    batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)  # at N pairs
-    pairs: tuple[int, ...] = (6, 9, 20, 100, 1000)
-    most_backward: int = 10_000  # largest batch size with gradients
-    rounds: int = 5  # at most
-    loop_s: float = 0.2  # for a contender in a round: a loop solves fewer problems, a shorter call is repeated
-    call_s: float = 2.0  # batches whose call takes longer are left out
-    point_s: float = 3.0  # for all rounds of one comparison, about
-    latency_calls: int = 1000  # calls with a single problem
-    latency_s: float = 2.5  # for these calls; slow contenders get fewer
-    memory_batch: int = 10_000  # of the memory measurement
-
-
-FULL = Settings()
-#: A few small problems, which show that everything runs.
-QUICK = Settings(None, 20, (1, 20), (6, 9), 20, 3, 0.01, 600.0, 1.0, 20, 1.0, 100)
 
 
 def draw(n: int, count: int, outliers: OutlierMix | None = None) -> Problems:
@@ -420,11 +377,6 @@ def random_cameras(n: int, count: int, seed: int, share: float, **options: Any) 
     """Problems of random cameras in float64; ``share`` is the share of outliers."""
     options |= {"batch_size": count, "seed": seed, "outlier_share": share, "dtype": torch.float64}
     return CameraProblems(n=n, **options).batch(0)
-
-
-def first(problems: Problems, count: int) -> Problems:
-    """The first ``count`` problems of a batch."""
-    return problems.map(lambda x: x[:count])
 
 
 def relative_errors(pose: Pose, problems: Problems) -> tuple[Tensor, Tensor]:

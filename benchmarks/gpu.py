@@ -3,8 +3,7 @@
 README.md beside this file describes the measurements.
 """
 
-from __future__ import annotations
-
+import gc
 import itertools
 import json
 import math
@@ -14,32 +13,32 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import contenders
 import torch
-from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw, first
-from harness import HERE, in_turns, parser, say, share, summary, without_garbage_collection
-from timing import BACKWARD, FORWARD
+from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw
+from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, share, summary
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from kornia_pnpnet import PnPNet, create_solver, list_solvers, pose_errors, success
+from kornia_pnpnet import PnPNet, create_solver, list_solvers, pose_errors, success, success_rate
 from kornia_pnpnet.core.environment import environment
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.core.trees import iter_tensors, take
 from kornia_pnpnet.evaluation.results import save_results
-from kornia_pnpnet.result import PnPResult, Pose, Problems
+from kornia_pnpnet.result import Pose, Problems
 
 #: Largest difference of a pose that counts as the same, in radians, and of a gradient, relative to its length.
 LIMITS = {torch.float32: 1e-3, torch.float64: 1e-6}
 _DRAWN = 10_000  # problems; larger batches repeat them
 
 
-# Rotations (B, 3, 3), ``ok`` (B,), and gradients (B, 5 N).
-_Found = tuple[Tensor, Tensor, Tensor]
+# Rotations (B, 3, 3), translations (B, 3), ``ok`` (B,), and gradients (B, 5 N).
+_Found = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class Amount(NamedTuple):
@@ -71,18 +70,9 @@ class Amount(NamedTuple):
 FULL = Amount()
 #: A few small problems without compiling, which show that everything runs.
 QUICK = Amount(
-    parity=4,
-    graphs=("pnpnet-n9",),
-    modes=("eager",),
-    calls=(1, 4),
-    waits=(),
-    contenders=("pnpnet-n9", "epnp-lm"),
-    batches=(4, 8),
-    pairs=(9, 12),
-    rounds=3,
-    copied=2**16,
-    side=64,
+    parity=4, graphs=("pnpnet-n9",), modes=("eager",), calls=(1, 4), waits=(), rounds=3, copied=2**16, side=64
 )
+QUICK = QUICK._replace(contenders=("pnpnet-n9", "epnp-lm"), batches=(4, 8), pairs=(9, 12))
 
 
 def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -99,37 +89,28 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         problems = draw(int(fixed[1]) if fixed else N, amount.parity)
         for dtype, limit in LIMITS.items():
             case = {"solver": name, "dtype": str(dtype).removeprefix("torch."), "limit": limit, "count": amount.parity}
+            found = []
             try:
-                found = [_solved(solver, problems, place, dtype) for place in ("cpu", device)]
+                for place in ("cpu", device):
+                    call = call_of(solver.to(place, dtype), problems, place, BACKWARD, dtype)
+                    found.append([x.cpu() for x in call()])
             except RuntimeError as error:
                 yield {**case, "why": reason(error)}
                 continue
-            (mine, slope, *_), (other, other_slope, *_) = found
-            both = mine.ok & other.ok
-            turned = rotation_difference(mine.rotation, other.rotation)
+            (rotation, _, ok, slope), (other_rotation, _, other_ok, other_slope) = found
+            both = ok & other_ok
+            turned = rotation_difference(rotation, other_rotation)
             length = torch.maximum(slope.norm(dim=1), other_slope.norm(dim=1)).clamp(min=torch.finfo(dtype).tiny)
             change = (slope - other_slope).norm(dim=1) / length
+            poses = [Pose(*(x.double() for x in one[:2])) for one in found]
             yield {
                 **case,
-                "success": [rate for *_, rate in found],  # on the CPU and on the device
+                "success": [success_rate(success(pose_errors(x, problems.pose))).rate for x in poses],
                 "both_ok": int(both.sum()),
-                "same_ok": share(mine.ok == other.ok),
+                "same_ok": share(ok == other_ok),
                 "same_pose": share(turned[both] <= limit),
                 "same_gradient": share(change[both] <= limit),
             }
-
-
-def _solved(solver: PnPNet, problems: Problems, device: str, dtype: torch.dtype) -> tuple[PnPResult, Tensor, float]:
-    """Result, gradient of the poses to points and pixels, (B, 5 N), both on the CPU, and the rate of success."""
-    world, img, intrinsics = (x.to(device, dtype, copy=True) for x in problems[:3])
-    leaves = [world.requires_grad_(), img.requires_grad_()]
-    result = solver.to(device, dtype)(world, img, intrinsics)
-    parts = contenders.gradient(result.pose, leaves) if result.rotation.requires_grad else (None, None)
-    filled = [torch.zeros_like(leaf) if part is None else part for part, leaf in zip(parts, leaves, strict=True)]
-    rotation, translation = (x.detach().cpu() for x in result.pose)
-    solved = success(pose_errors(Pose(rotation.double(), translation.double()), problems.pose))
-    on_cpu = result._replace(rotation=rotation, ok=result.ok.cpu())
-    return on_cpu, torch.cat([x.flatten(1) for x in filled], 1).cpu(), float(solved.double().mean())
 
 
 def reason(error: BaseException) -> str:
@@ -162,8 +143,10 @@ def captured(call: Callable[[], _Found]) -> Callable[[], _Found]:
             call()
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
-    # Garbage can contain another graph, and to free a graph ends the capture.
-    with without_garbage_collection(), torch.cuda.graph(graph):
+    with ExitStack() as stack:
+        gc.disable()  # garbage can contain another graph, and to free a graph ends the capture
+        stack.callback(gc.enable)
+        stack.enter_context(torch.cuda.graph(graph))
         result = call()
 
     def replay() -> _Found:
@@ -200,10 +183,10 @@ def _modes(
     for mode, solver in solvers.items():
         call = call_of(solver, problems, device, direction)
         try:
-            task = _task(captured(call) if mode == "captured" else call, problems, device)
+            task = Task(captured(call) if mode == "captured" else call, lambda: problems.pose, problems, device)
             start = time.perf_counter()
             task.warm()
-            rotation, ok, slope = (x.clone() for x in task.call())  # the next replay overwrites its result
+            rotation, _, ok, slope = (x.clone() for x in task.call())  # the next replay overwrites its result
         except (CannotBeTimedError, RuntimeError) as error:
             modes[mode] = {"why": reason(error)}
             continue
@@ -215,31 +198,28 @@ def _modes(
             "same_ok": share(ok == expected[1]),
             "same_gradient": share((slope - expected[2]).norm(dim=1) <= 1e-2 * expected[2].norm(dim=1)),
         }
-    timers = {mode: partial(_microseconds, task, 10) for mode, task in tasks.items()}
-    for mode, rounds_us in in_turns(timers, rounds).items():
-        modes[mode] |= summary(rounds_us)
+    timers = {mode: partial(task.seconds, 10) for mode, task in tasks.items()}
+    for mode, times in in_turns(timers, rounds).items():
+        modes[mode] |= summary([1e6 * x for x in times])
     return modes
 
 
-def call_of(solver: nn.Module, problems: Problems, device: str, direction: str) -> Callable[[], _Found]:
-    """A call that returns rotations, ``ok``, and gradients to points and pixels, which are empty forward."""
-    world, img, intrinsics = contenders.float_inputs(problems, device)
-    if direction == FORWARD:
+def call_of(
+    solver: nn.Module, problems: Problems, device: str, direction: str, dtype: torch.dtype = torch.float32
+) -> Callable[[], _Found]:
+    """A call that returns poses, ``ok``, and gradients to points and pixels, which are empty forward."""
+    *pairs, intrinsics = (x.to(device, dtype) for x in problems[:3])
+    backward = direction == BACKWARD
+    leaves = [x.detach().requires_grad_(backward) for x in pairs]
 
-        @torch.no_grad()
-        def forward() -> _Found:
-            result = solver(world, img, intrinsics)
-            return result.rotation, result.ok, world.new_zeros(len(world), 0)
+    def call() -> _Found:
+        with torch.set_grad_enabled(backward):
+            result = solver(*leaves, intrinsics)
+        slopes = contenders.gradient(result.pose, leaves) if backward else [pairs[0].new_zeros(len(result.ok), 0)]
+        rotation, translation = (x.detach() for x in result.pose)
+        return rotation, translation, result.ok, torch.cat([x.flatten(1) for x in slopes], 1)
 
-        return forward
-    leaves = [x.detach().requires_grad_() for x in (world, img)]
-
-    def with_gradients() -> _Found:
-        result = solver(*leaves, intrinsics)
-        slopes = contenders.gradient(result.pose, leaves)
-        return result.rotation.detach(), result.ok, torch.cat([x.flatten(1) for x in slopes], 1)
-
-    return with_gradients
+    return call
 
 
 def waits(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -262,10 +242,6 @@ def waits(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         yield {"solver": name, "effort": effort, "mode": direction, "waits": places.total(), "places": dict(places)}
 
 
-def _microseconds(task: Task, times: int = 1) -> float:
-    return 1e6 * task.seconds(times)
-
-
 class Work(TorchDispatchMode):
     """Count the bytes that operations read and write, and floating point operations.
 
@@ -285,32 +261,22 @@ class Work(TorchDispatchMode):
             written = list(iter_tensors(result))
             product = flop_registry.get(func.overloadpacket)
             self.flops += product(*args, **kwargs, out_val=result) if product else sum(x.numel() for x in written)
-            self.bytes += size_bytes((args, *kwargs.values(), written))
+            self.bytes += sum(x.nbytes for x in iter_tensors((args, *kwargs.values(), written)))
         return result
-
-
-def size_bytes(tree: object) -> int:
-    """Bytes of the tensors of nested tuples."""
-    return sum(x.numel() * x.element_size() for x in iter_tensors(tree))
 
 
 def machine_rates(device: str, amount: Amount) -> dict[str, float]:
     """Bytes per second of a copy, read and written, and operations per second of a product of float32 matrices."""
     source = torch.zeros(amount.copied, device=device)
     target, matrix = torch.empty_like(source), torch.ones(amount.side, amount.side, device=device)
-    problems = draw(N, 1)  # a task has problems; these are not solved
+    problems = draw(N, 1)  # of the tasks; not solved
 
     def quickest(call: Callable[[], object]) -> float:
-        task = _task(call, problems, device)
+        task = Task(call, lambda: problems.pose, problems, device)
         return min(task.seconds() for _ in range(10))
 
     copy, product = quickest(lambda: target.copy_(source)), quickest(lambda: matrix @ matrix)
-    return {"bytes_per_s": 2 * size_bytes(source) / copy, "flops_per_s": 2 * amount.side**3 / product}
-
-
-def _task(call: Callable[[], object], problems: Problems, device: str) -> Task:
-    """A task whose poses nobody asks for."""
-    return Task(call, lambda: problems.pose, problems, device)
+    return {"bytes_per_s": 2 * source.nbytes / copy, "flops_per_s": 2 * amount.side**3 / product}
 
 
 def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[str, float]:
@@ -318,14 +284,13 @@ def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[st
     task = contender.task(problems, backward=backward)
     with Work() as counted:
         task.call()
-    points, pixels, pose = problems.world_points, problems.img_points, problems.pose
-    moved = [*(2 if backward else 1) * [points, pixels], problems.intrinsics, *pose]
-    count = len(points)
-    return {
-        "least_bytes": sum(4 * x.numel() for x in moved) / count,  # float32
-        "bytes": counted.bytes / count,
-        "flops": counted.flops / count,
-    }
+    moved = [*(2 if backward else 1) * problems[:2], problems.intrinsics, *problems.pose]
+    total = {
+        "least_bytes": sum(4 * x.numel() for x in moved),
+        "bytes": counted.bytes,
+        "flops": counted.flops,
+    }  # float32
+    return {key: value / task.size for key, value in total.items()}
 
 
 def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -348,27 +313,24 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
             if (expected_s := _expected_s(known[mode], batch)) > amount.call_s:
                 yield {**place, "why": f"a call would take about {expected_s:.0f} s"}
                 continue
-            repeats = range(math.ceil(batch / len(drawn.world_points)))
-            problems = first(map_tensors(lambda *x: torch.cat(x), *(drawn for _ in repeats)), batch)
+            problems = take(drawn, torch.arange(batch) % len(drawn.world_points))
             start = time.perf_counter()
             try:
                 task = contender.task(problems, backward=mode == BACKWARD)
                 task.warm()
-            except CannotBeTimedError as error:
+            except (CannotBeTimedError, RuntimeError) as error:
                 yield {**place, "why": reason(error)}
+                if isinstance(error, RuntimeError):
+                    continue
                 break  # it has failed to compile, and runs uncompiled from now on
-            except RuntimeError as error:
-                yield {**place, "why": reason(error)}
-                continue
             place["warm_s"] = time.perf_counter() - start
-            each = work(plain, first(problems, 1000), backward=mode == BACKWARD)
-            peak = peak_bytes(task, device)
-            found = summary([_microseconds(task) / batch for _ in range(amount.rounds)])
+            each = work(plain, take(problems, slice(1000)), backward=mode == BACKWARD)
+            place["peak_bytes"] = peak_bytes(task, device)
+            found = summary([task.us() for _ in range(amount.rounds)])
             known[mode].append((batch, found["median_us"] * batch / 1e6))
             floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
             traffic_s = each["bytes"] / rates["bytes_per_s"]
             shares = {key: 1e6 * x / found["median_us"] for key, x in (("floor", floor_s), ("traffic", traffic_s))}
-            place["peak_bytes"] = peak
             if batch == amount.batches[0]:
                 place["success"] = task.success().rate
             yield {**place, "work": each, "shares": shares, **found}
@@ -383,12 +345,11 @@ def _expected_s(known: list[tuple[int, float]], batch: int) -> float:
 
 
 def _looped(name: str, n: int, amount: Amount) -> dict[str, Any]:
-    batch = amount.batches[0]
     say(f"throughput: {name}, n = {n}")
-    task = contenders.CONTENDERS[name]().task(draw(n, batch))
+    task = contenders.CONTENDERS[name]().task(draw(n, amount.batches[0]))
     task.warm()
-    times = summary([_microseconds(task) / batch for _ in range(amount.rounds)])
-    return {"contender": name, "mode": FORWARD, "n": n, "batch": batch, "success": task.success().rate, **times}
+    place = {"contender": name, "mode": FORWARD, "n": n, "batch": task.size, "success": task.success().rate}
+    return {**place, **summary([task.us() for _ in range(amount.rounds)])}
 
 
 def peak_bytes(task: Task, device: str) -> int | None:
@@ -416,12 +377,8 @@ def main(arguments: Sequence[str] | None = None, amount: Amount | None = None) -
     results = json.loads(options.out.read_text()) if options.out.exists() else {}
     for part in options.parts:
         settings = {"device": options.device, **amount._asdict()}
-        results[part] = {
-            "environment": environment(),
-            "settings": settings,
-            "load_average": os.getloadavg()[0],
-            "rows": [],
-        }
+        made = {"environment": environment(), "settings": settings, "load_average": os.getloadavg()[0]}
+        results[part] = {**made, "rows": []}
         for row in PARTS[part](options.device, amount):
             if "rates" in row:
                 results[part] |= row

@@ -1,15 +1,14 @@
 """What the benchmarks share: threads, timing in turns, processes of their own, results files and tables."""
 
-from __future__ import annotations
-
 import argparse
-import gc
+import itertools
 import json
 import os
 import statistics
 import subprocess
 import sys
 import time
+import timeit
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +24,8 @@ from kornia_pnpnet.core.performance import keep_freed_memory
 from kornia_pnpnet.core.tables import markdown_table
 
 HERE = Path(__file__).resolve().parent
+#: What a call does.
+FORWARD, BACKWARD = "forward", "forward+backward"
 
 Row = Mapping[str, Any]
 
@@ -49,33 +50,16 @@ def threads(count: int = 1) -> Iterator[None]:
             change(number)
 
 
-@contextmanager
-def without_garbage_collection() -> Iterator[None]:
-    """Do not collect garbage, as in :mod:`timeit`."""
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collecting:
-            gc.enable()
-
-
-def seconds(call: Callable[[], object], times: int = 1) -> float:
-    """Seconds of a call, the mean over ``times`` calls."""
-    start = time.perf_counter()
-    for _ in range(times):
-        call()
-    return (time.perf_counter() - start) / times
+def seconds(call: Callable[[], object], times: int = 1, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Seconds of a call, the mean over ``times`` calls, without garbage collection."""
+    return timeit.timeit(call, timer=clock, number=times) / times
 
 
 def in_turns(timers: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
     """Ask each timer once in every round, so that a slow minute of the machine hits all of them."""
     found: dict[str, list[float]] = {name: [] for name in timers}
-    with without_garbage_collection():
-        for _ in range(rounds):
-            for name, timer in timers.items():
-                found[name].append(timer())
+    for _, (name, timer) in itertools.product(range(rounds), timers.items()):
+        found[name].append(timer())
     return found
 
 

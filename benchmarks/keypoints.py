@@ -10,8 +10,6 @@ the others are measured. PoseLib's threshold is ``inlier_px``; masked, it gets p
 The error is the rotation error in radians plus the translation error relative to the distance of the points' centre.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

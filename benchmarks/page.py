@@ -1,7 +1,5 @@
 """``docs/performance.md`` and its pictures, from ``performance.md.jinja`` and the results files."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,11 +10,9 @@ import harness
 import numpy as np
 import pandas as pd
 from contenders import ANY, COARSE_ANGLE_DEG, COARSE_SHIFT, ITERATIONS, PLAIN, TRAINED, N
-from harness import HERE, Row
-from timing import BACKWARD, FORWARD
+from harness import BACKWARD, FORWARD, HERE, Row
 
 from kornia_pnpnet import PnPNet
-from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.evaluation.plots import WIDTH, log_scale, make_figure, save, themed
 from kornia_pnpnet.metrics import SuccessRate
 
@@ -27,10 +23,9 @@ PAGE = HERE.parent / "docs" / "performance.md"
 PARTS = ("throughput", "latency", "startup")
 #: Caches of the compiler at a start, or no compiler.
 COLD, CACHED, EAGER = "cold", "cached", "eager"
-#: Contenders that the pictures also show.
-DRAWN = ("p3p-ransac", "kornia-dlt")
-#: Other libraries.
+#: Other libraries, and what the pictures show besides the solvers of ours that users call.
 PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
+DRAWN = (*PEERS, "p3p-ransac", "kornia-dlt")
 
 Rows = Mapping[str, Row]  # by contender
 
@@ -73,12 +68,11 @@ def leaders(alone: Rows, many: Rows) -> list[str]:
     """For one problem and for batches, the fastest of ours and of the other libraries."""
     found = []
     for what, rows in (("One problem at a time", alone), ("Batches", many)):
+        us = {name: row["median_us"] for name, row in rows.items()}
         sides = [*filter(is_whole, rows)], [name for name in PEERS if name in rows]
         if all(sides):
-            best = (min(side, key=lambda name: rows[name]["median_us"]) for side in sides)
-            fast, slow = sorted(best, key=lambda name: rows[name]["median_us"])
-            times = rows[slow]["median_us"] / rows[fast]["median_us"]
-            found.append(f"{what}: `{fast}` is fastest, {times:.1f} times as fast as `{slow}`.")
+            fast, slow = sorted((min(side, key=us.__getitem__) for side in sides), key=us.__getitem__)
+            found.append(f"{what}: `{fast}` is fastest, {us[slow] / us[fast]:.1f} times as fast as `{slow}`.")
     return found
 
 
@@ -99,22 +93,22 @@ def gpu_section(results: Row | None) -> dict[str, Any] | None:
     part = results["throughput"]
     rows = [row for row in part["rows"] if "median_us" in row]
     loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
-    groups: dict[tuple[str, int, str], dict[int, Row]] = {}
+    groups: dict[tuple[str, int, str], list[Row]] = {}
     for row in rows:
         if "work" in row:
-            groups.setdefault((row["contender"], row["n"], row["mode"]), {})[row["batch"]] = row
-    lines = {}
-    for place, found in groups.items():
-        best = min(found.values(), key=lambda row: row["median_us"])
+            groups.setdefault((row["contender"], row["n"], row["mode"]), []).append(row)
+    lines = []
+    for group in groups.values():
+        best = min(group, key=lambda row: row["median_us"])
         faster = f"{loops[best['n']]['median_us'] / best['median_us']:.0f}"
-        lines[place] = {**best, "us": {batch: row["median_us"] for batch, row in found.items()}, "faster": faster}
+        lines.append({**best, "us": {row["batch"]: row["median_us"] for row in group}, "faster": faster})
     complete = [x for x in results["parity"]["rows"] if None not in (x.get("same_pose"), x.get("same_gradient"))]
     return {
         "made": part["environment"],
         "poselib_us": loops[N]["median_us"],
         "count": results["parity"]["settings"]["parity"],
         "batches": part["settings"]["batches"],
-        "throughput": lines.values(),
+        "throughput": lines,
         "graphs": results["graphs"]["rows"],
         "modes": results["graphs"]["settings"]["modes"],
         "waits": results["waits"]["rows"],
@@ -187,14 +181,11 @@ def plot_latency(path: Path, title: str, rows: Sequence[Row]) -> Path:
     looks = _looks(row["contender"] for row in rows)
     figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()
-    for name, look in looks.items():
-        for row in rows:
-            if row["contender"] != name:
-                continue
-            shares = np.linspace(0, 1, len(row["quantiles_us"]))
-            kept = shares <= _LAST_SHARE
-            x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
-            axes.plot(x, y, **look, markevery=max(1, len(x) // 5))
+    for name, row in sorted(matching(rows).items(), key=lambda x: list(looks).index(x[0])):
+        shares = np.linspace(0, 1, len(row["quantiles_us"]))
+        kept = shares <= _LAST_SHARE
+        x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
+        axes.plot(x, y, **looks[name], markevery=max(1, len(x) // 5))
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
     log_scale(axes, "x")
     figures.draw_legend(figure, looks)
@@ -215,22 +206,23 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def is_drawn(row: Row) -> bool:
-    """Whether the pictures show a row: solvers of ours that users call, and other libraries, on one thread."""
-    return row["threads"] == 1 and (is_whole(row["contender"]) or row["contender"] in (*PEERS, *DRAWN))
-
-
 def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """The results files, and the results file of a GPU when there is one."""
-    results = {part: json.loads((folder / f"{part}.json").read_text(encoding="utf-8")) for part in PARTS}
-    gpu = folder / "gpu.json"
-    return results, json.loads(gpu.read_text(encoding="utf-8")) if gpu.exists() else None
+    found = {path.stem: json.loads(path.read_bytes()) for path in folder.glob("*.json") if path.stem in (*PARTS, "gpu")}
+    return {part: found[part] for part in PARTS}, found.get("gpu")
 
 
 def render(folder: Path, path: Path) -> None:
     """Write the page and its pictures from the results files of a folder."""
     results, gpu = load_parts(folder)
-    rows = [row for row in results["throughput"]["rows"] if is_drawn(row)]
+    rows, alone = (
+        [
+            x
+            for x in results[part]["rows"]
+            if x["threads"] == 1 and (is_whole(x["contender"]) or x["contender"] in DRAWN)
+        ]
+        for part in ("throughput", "latency")
+    )
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
     batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
     pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != N)]
@@ -238,7 +230,5 @@ def render(folder: Path, path: Path) -> None:
     fewer = "".join(f" ({b} at n = {n})" for n, b in sorted({(x["n"], x["batch"]) for x in pairs}) if b < size)
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
     plot_times(pictures / "pairs.png", title, {FORWARD: pairs}, against="n", label="pairs n")
-    alone = [row for row in results["latency"]["rows"] if is_drawn(row)]
     plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 outliers, one thread", alone)
-    with atomic_open(path, encoding="utf-8") as file:
-        file.write(page(results, gpu))
+    path.write_text(page(results, gpu), encoding="utf-8")

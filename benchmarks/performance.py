@@ -4,35 +4,204 @@
 pictures from these files. README.md beside this file describes the measurements.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
+import math
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import page
-import timing
-from contenders import FULL, PLAIN, QUICK, TRAINED, WHOLE, Settings, make_contenders
-from harness import HERE, Row, recorded, run_child, say, target, threads
+import torch
+from contenders import ANY, PLAIN, TRAINED, WHOLE, CannotBeTimedError, Contender, N, Task, draw, make_contenders
+from harness import BACKWARD, FORWARD, HERE, Row, in_turns, ratio, recorded, run_child, say, summary, target, threads
 from page import CACHED, COLD, EAGER
 
+from kornia_pnpnet.core.trees import take
+from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.result import Problems
 
 COMPILED = f"{TRAINED} compiled"
+_PROBE = 10  # problems of the first call of a loop
+_FEWEST_ROUNDS = 3
+# Pairs in a batch of the rows that vary n: the memory of some contenders grows with the square of n.
+_MOST_PAIRS = 100_000
+
+
+class Settings(NamedTuple):
+    """How much is measured."""
+
+    contenders: Sequence[str] | None = None  # names; None: all
+    problems: int = 1000  # that success is counted on; batch size of the rows with other numbers of pairs than N
+    batches: tuple[int, ...] = (1, 10, 100, 1000, 10_000, 100_000)  # at N pairs
+    pairs: tuple[int, ...] = (6, 9, 20, 100, 1000)
+    most_backward: int = 10_000  # largest batch size with gradients
+    rounds: int = 5  # at most
+    loop_s: float = 0.2  # for a contender in a round: a loop solves fewer problems, a shorter call is repeated
+    call_s: float = 2.0  # batches whose call takes longer are left out
+    point_s: float = 3.0  # for all rounds of one comparison, about
+    latency_calls: int = 1000  # calls with a single problem
+    latency_s: float = 2.5  # for these calls; slow contenders get fewer
+    memory_batch: int = 10_000  # of the memory measurement
+
+
+FULL = Settings()
+#: A few small problems, which show that everything runs.
+QUICK = Settings(None, 20, (1, 20), (6, 9), 20, 3, 0.01, 600.0, 1.0, 20, 1.0, 100)
+
+
+def grid(settings: Settings, count: int) -> Iterator[tuple[int, list[tuple[int, str]]]]:
+    """For each number of pairs the batch sizes and modes; fewer of them with more than one thread."""
+    sizes = [size for size in settings.batches if count == 1 or size >= settings.problems]
+    backward = [size for size in sizes if size <= settings.most_backward][: None if count == 1 else 1]
+    for n in settings.pairs:
+        if n == N:
+            yield n, [*((size, FORWARD) for size in sizes), *((size, BACKWARD) for size in backward)]
+        elif count == 1:
+            yield n, [(max(1, min(settings.problems, _MOST_PAIRS // n)), FORWARD)]
+
+
+def ready(
+    contender: Contender, problems: Problems, settings: Settings, *, backward: bool = False, known: float = 0.0
+) -> tuple[Task, float]:
+    """A warm task, and the seconds of its call.
+
+    A loop gets the first problems, enough for ``settings.loop_s`` seconds. ``known``: seconds per problem of an earlier
+    measurement. CannotBeTimedError when the call would take too long, or the contender cannot compile.
+    """
+    expected = known * len(problems.world_points)
+    if contender.loops:
+        task = contender.task(take(problems, slice(_PROBE)), backward=backward)
+        task.seconds()
+        problems = take(problems, slice(max(task.size, int(settings.loop_s * task.size / task.seconds()))))
+    elif expected > settings.call_s:
+        raise CannotBeTimedError(f"a call would take about {expected:.0f} s")
+    task = contender.task(problems, backward=backward)
+    return task, task.warm()
+
+
+def measure_throughput(settings: Settings, count: int) -> dict[str, list[dict[str, Any]]]:
+    """Times on ``count`` threads. The entry ``count`` of a row is less than the batch for a loop."""
+    rows: list[dict[str, Any]] = []
+    skipped: list[dict[str, Any]] = []
+    # Seconds per problem of the last measurement, scaled in proportion to the number of pairs.
+    known: defaultdict[tuple[str, str], float] = defaultdict(float)
+    before = settings.pairs[0]
+    for n, points in grid(settings, count):
+        known = defaultdict(float, {key: seconds * max(1.0, n / before) for key, seconds in known.items()})
+        before = n
+        torch.compiler.reset()  # compile for this number of pairs only
+        contenders, missing = make_contenders(settings.contenders)
+        skipped += [{**entry, "threads": count, "n": n} for entry in missing]
+        problems = draw(n, max(settings.problems, *(batch for batch, _ in points)))
+        rates: dict[str, dict[str, Any]] = {}
+        for batch, mode in points:
+            say(f"throughput: {count} thread(s), n = {n}, B = {batch}, {mode}")
+            place = {"threads": count, "mode": mode, "n": n, "batch": batch}
+            some, backward = take(problems, slice(batch)), mode == BACKWARD
+            tasks: dict[str, tuple[Task, float]] = {}
+            for name, contender in contenders.items():
+                if not contender.takes(n) or (backward and not contender.differentiable):
+                    continue
+                try:
+                    task, once = ready(contender, some, settings, backward=backward, known=known[name, mode])
+                except CannotBeTimedError as error:
+                    skipped.append({"contender": name, **place, "why": str(error)})
+                    continue
+                if name not in rates:  # after the first call, which shows whether the contender compiles
+                    rates[name] = rate(contender, take(problems, slice(settings.problems)), settings)
+                tasks[name] = task, once
+                known[name, mode] = once / task.size
+            for name, times in timed(tasks, settings).items():
+                found = {"count": tasks[name][0].size, "success": rates[name], **summary(times)}
+                rows.append({"contender": name, **place, **found})
+    return {"rows": rows, "skipped": skipped}
+
+
+def rate(contender: Contender, problems: Problems, settings: Settings) -> dict[str, Any]:
+    """Success; a loop gets the problems that it solves in a tenth of ``settings.point_s``."""
+    if contender.loops:
+        _, once = ready(contender, take(problems, slice(_PROBE)), settings)
+        problems = take(problems, slice(max(_PROBE, int(_PROBE * settings.point_s / 10 / once))))
+    return contender.task(problems).success()._asdict()
+
+
+def timed(tasks: Mapping[str, tuple[Task, float]], settings: Settings) -> dict[str, list[float]]:
+    """Microseconds per problem of each round, of what :func:`ready` returned."""
+    # Repeated for as long as a loop takes: a single call would begin with the data of other contenders in the caches.
+    times = {name: max(1, math.ceil(settings.loop_s / once)) for name, (_, once) in tasks.items()}
+    round_s = sum(times[name] * once for name, (_, once) in tasks.items())
+    rounds = min(settings.rounds, max(_FEWEST_ROUNDS, int(settings.point_s / round_s))) if tasks else 0
+    return in_turns({name: partial(task.us, times[name]) for name, (task, _) in tasks.items()}, rounds)
+
+
+#: Number of quantiles of a distribution in the file, besides the smallest value.
+QUANTILE_STEPS = 200
+_TURN = 20  # calls of a contender in a row; one more call before them is not timed
+_WARM = 10  # calls before all others
+
+
+def measure_latency(settings: Settings, count: int) -> dict[str, list[dict[str, Any]]]:
+    """Call every contender with one problem at a time, on ``count`` threads."""
+    # The page shows the distribution on one thread, and only the median on two.
+    problems = draw(N, settings.latency_calls if count == 1 else max(1, settings.latency_calls // 4), OutlierMix())
+    rows = []
+    contenders, skipped = make_contenders(settings.contenders)
+    tasks = {}
+    for name, contender in contenders.items():
+        say(f"latency: {count} thread(s), {name}")
+        try:
+            tasks[name] = single_tasks(contender, problems, settings)
+        except CannotBeTimedError as error:
+            skipped.append({"contender": name, "why": str(error)})
+    times = latencies(tasks)
+    for name, mine in tasks.items():
+        success = contenders[name].task(take(problems, slice(len(mine)))).success()._asdict()
+        # Each quantile is one of the times.
+        spread = np.quantile(times[name], np.linspace(0, 1, QUANTILE_STEPS + 1), method="inverted_cdf").tolist()
+        tail = {f"p{share}_us": spread[round(share / 100 * QUANTILE_STEPS)] for share in (90, 99)}
+        row = {"contender": name, "threads": count, "calls": len(mine), "success": success}
+        row |= {"median_us": statistics.median(times[name]), **tail, "max_us": spread[-1]}
+        rows.append({**row, "quantiles_us": [round(value, 2) for value in spread]})
+    return {"rows": rows, "skipped": [{**entry, "threads": count} for entry in skipped]}
+
+
+def single_tasks(contender: Contender, problems: Problems, settings: Settings) -> list[Task]:
+    """Warm tasks of one problem each, for ``settings.latency_s`` seconds of calls."""
+
+    def one(index: int) -> Task:
+        return contender.task(take(problems, slice(index, index + 1)))
+
+    most = max(_TURN, int(settings.latency_s / one(0).warm()))
+    tasks = [one(index) for index in range(min(most, len(problems.world_points)))]
+    for task in tasks[:_WARM]:
+        task.seconds()
+    return tasks
+
+
+def latencies(tasks: Mapping[str, Sequence[Task]]) -> dict[str, list[float]]:
+    """Microseconds of every call, ``_TURN`` calls of each contender in turn."""
+    found: dict[str, list[float]] = {name: [] for name in tasks}
+    for start in range(0, max(map(len, tasks.values()), default=0), _TURN):
+        for name, mine in tasks.items():
+            turn = mine[start : start + _TURN]
+            found[name] += [task.us() for task in (*turn[:1], *turn)][1:]
+    return found
 
 
 def measure_threads(part: str, settings: Settings, count: int) -> dict[str, list[dict[str, Any]]]:
     """Throughput or latency on ``count`` threads, in this process."""
     with threads(count):
-        return (timing.measure_throughput if part == "throughput" else timing.measure_latency)(settings, count)
+        return (measure_throughput if part == "throughput" else measure_latency)(settings, count)
 
 
 def measure_part(part: str, settings: Settings) -> dict[str, Any]:
@@ -46,7 +215,7 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
         for request in requests
     ]
     found = {key: [entry for answer in answers for entry in answer[key]] for key in ("rows", "skipped")}
-    targets = timing.throughput_targets if part == "throughput" else timing.latency_targets
+    targets = throughput_targets if part == "throughput" else latency_targets
     return {**found, "targets": targets(found["rows"])}
 
 
@@ -63,7 +232,7 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
 
     Compiled contenders start with an empty cache of the compiler, and again with the cache of that first start.
     """
-    contenders, skipped = make_contenders(settings)
+    contenders, skipped = make_contenders(settings.contenders)
     starts = []
     for name, contender in contenders.items():
         if name.startswith(PLAIN) and name != WHOLE:
@@ -95,6 +264,33 @@ def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]
         return [measured(cache, batches, TORCHINDUCTOR_CACHE_DIR=folder) for cache in (COLD, CACHED)]
 
 
+def throughput_targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Targets of 1000 problems of 9 pairs with 3 mismatches on one thread, where both sides were measured."""
+    here = page.matching(rows, threads=1, n=N, batch=1000, mode=FORWARD)
+    found = []
+    for name, most in (("refinement compiled", 3.0), (f"{TRAINED} compiled", 8.0)):
+        if name in here:
+            found.append(target(f"`{name}`, per problem", here[name]["median_us"], most, unit="µs"))
+    for solver, peer, least in ((TRAINED, "opencv-ransac", 20.0), (TRAINED, "poselib", 10.0), (ANY, "poselib", 5.0)):
+        mine = f"{solver} compiled"
+        if mine in here and peer in here:
+            what = f"`{mine}` against `{peer}`, {FORWARD}"
+            found.append(target(what, ratio(here[mine], here[peer]), least, unit="times as fast", at_most=False))
+    return found
+
+
+def latency_targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Targets of one problem on one thread."""
+    found = []
+    alone = page.matching(rows, threads=1)
+    for name, most_ms in {WHOLE: 0.4, f"{TRAINED} compiled": 0.4, PLAIN: 3.0, TRAINED: 3.0}.items():
+        if row := alone.get(name):
+            found.append(target(f"`{name}`, one problem, median", row["median_us"] / 1e3, most_ms, unit="ms"))
+            tail = f"`{name}`, one problem, 99th percentile by the median"
+            found.append(target(tail, row["p99_us"] / row["median_us"], 2.0))
+    return found
+
+
 def startup_targets(starts: Sequence[Row], imports: Sequence[float]) -> list[dict[str, Any]]:
     """Most seconds of the import, and of making a compiled solver with its first call."""
     what = "`import kornia_pnpnet` after torch and kornia"
@@ -103,7 +299,7 @@ def startup_targets(starts: Sequence[Row], imports: Sequence[float]) -> list[dic
     if any("compil" in text for entry in compiled for text in entry["warnings"]):
         return found  # there is no compiler
     for entry in sorted(compiled, key=lambda entry: (entry["backward"], entry["cache"] == CACHED)):
-        most, mode = 20.0 if entry["cache"] == COLD else 5.0, timing.BACKWARD if entry["backward"] else timing.FORWARD
+        most, mode = 20.0 if entry["cache"] == COLD else 5.0, BACKWARD if entry["backward"] else FORWARD
         what, first = f"`{COMPILED}`, first call, {mode}, {entry['cache']}", entry["calls"][0]["first_s"]
         found.append(target(what, entry["make_s"] + first, most, unit="s"))
     return found
@@ -127,8 +323,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.step == "render":
         page.render(options.results, options.page)
         return
-    contenders = tuple(options.contenders) if options.contenders else None
-    settings = (QUICK if options.quick else FULL)._replace(contenders=contenders)
+    settings = (QUICK if options.quick else FULL)._replace(contenders=options.contenders)
     installed = {entry.name.lower(): entry.version for entry in distributions()}
     for part in options.parts:
         path = options.results / f"{part}.json"

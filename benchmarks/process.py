@@ -4,8 +4,6 @@
 The top of this file must not import PyTorch: the imports are timed.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -14,8 +14,6 @@ reference pose, and of these the three with the most. ``--batch`` gives the numb
 ``cost`` times solvers by share of outliers and number of pairs.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import math
@@ -29,11 +27,7 @@ import numpy as np
 import torch
 from harness import Row, pivot, recorded, say, share, threads
 from kornia.core.exceptions import BaseError
-from kornia.geometry.epipolar import (
-    fundamental_from_projections,
-    left_to_right_epipolar_distance,
-    right_to_left_epipolar_distance,
-)
+from kornia.geometry import epipolar
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -42,7 +36,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import pose_errors
 from kornia_pnpnet.core.files import read_npz
-from kornia_pnpnet.core.trees import take
+from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data.colmap import _find_model
 from kornia_pnpnet.evaluation import SeesTruth
 from kornia_pnpnet.evaluation.named_solvers import load_solver
@@ -131,12 +125,12 @@ class Matches(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """What a solver found for all problems."""
+    """What a solver found, for problems (P,)."""
 
     pose: Pose
-    ok: Tensor  # (P,)
-    milliseconds: Tensor  # (P,) of the processor, the same for all problems of a batch
-    probability: Tensor  # (P,) NaN where the solver has none
+    ok: Tensor
+    milliseconds: Tensor  # of the processor, the same for all problems of a batch
+    probability: Tensor  # NaN where the solver has none
 
 
 def read_views(folder: Path, features: int) -> list[View]:
@@ -177,12 +171,14 @@ def nearest(query: NDArray[np.float32], train: NDArray[np.float32]) -> tuple[Who
 
 def agree(first: View, second: View, pairs: Whole) -> NDArray[np.bool_]:
     """Whether matched keypoints (M, 2) lie close to each other's epipolar line under the poses of the model."""
-    one, two = (torch.from_numpy(view.intrinsics @ view.pose)[None] for view in (first, second))
-    fundamental = fundamental_from_projections(one, two)
-    points = [torch.from_numpy(view.pixels[at])[None] for view, at in zip((first, second), pairs.T, strict=True)]
-    right = left_to_right_epipolar_distance(points[0], points[1], fundamental)[0]
-    left = right_to_left_epipolar_distance(points[0], points[1], fundamental)[0]
-    return ((right < EPIPOLAR_PX) & (left < EPIPOLAR_PX)).numpy()
+    views = first, second
+    fundamental = epipolar.fundamental_from_projections(
+        *(torch.from_numpy(view.intrinsics @ view.pose)[None] for view in views)
+    )
+    one, two = (torch.from_numpy(view.pixels[at])[None] for view, at in zip(views, pairs.T, strict=True))
+    right = epipolar.left_to_right_epipolar_distance(one, two, fundamental)
+    left = epipolar.right_to_left_epipolar_distance(one, two, fundamental)
+    return ((right < EPIPOLAR_PX) & (left < EPIPOLAR_PX))[0].numpy()
 
 
 def tracks(views: Sequence[View]) -> list[Whole]:
@@ -224,7 +220,7 @@ def triangulate(views: Sequence[View]) -> list[Floats]:
     found = [np.full((len(view.pixels), 3), np.nan) for view in views]
     for track in tracks(views):
         pixels = np.array([views[i].pixels[at] for i, at in track])
-        chosen = [poses[i] for i, _ in track], [cameras[i] for i, _ in track]
+        chosen = [[x[i] for i, _ in track] for x in (poses, cameras)]
         made = pycolmap.estimate_triangulation(pixels, chosen[0], chosen[1], options)
         if made is not None and all(made["inliers"]):
             for i, at in track:
@@ -269,9 +265,9 @@ def make(folder: Path, out: Path, *, features: int, every: int, views: int, pair
                     continue
                 at = generator.permutation(at)[:pairs]
                 error = np.linalg.norm(query.project(world[at]) - query.pixels[at], axis=1)
-                error[np.isnan(error)] = np.inf
-                row = {"world": world[at], "pixels": query.pixels[at], "ratio": ratio[at], "error_px": error}
-                row |= {"mask": np.ones(len(at), dtype=bool), "kind": kind, "K": query.intrinsics}
+                error = np.where(np.isnan(error), np.inf, error).astype(np.float32)
+                row = {"world": world[at], "pixels": query.pixels[at], "ratio": ratio[at].astype(np.float32)}
+                row |= {"error_px": error, "mask": np.ones(len(at), dtype=bool), "kind": kind, "K": query.intrinsics}
                 row |= {"R": query.pose[:, :3], "t": query.pose[:, 3]}
                 rows.append(row | {"query": query.name, "database": database[number].name})
     if not rows:
@@ -279,8 +275,7 @@ def make(folder: Path, out: Path, *, features: int, every: int, views: int, pair
     arrays: dict[str, Any] = {name: np.stack([row[name] for row in rows]) for name in rows[0] if name not in OF_PAIRS}
     for name in OF_PAIRS:
         filling = np.inf if name == "error_px" else 0
-        padded = pad_sequence([torch.from_numpy(row[name]) for row in rows], True, filling).numpy()
-        arrays[name] = padded.astype(np.float32) if name in ("ratio", "error_px") else padded
+        arrays[name] = pad_sequence([torch.from_numpy(row[name]) for row in rows], True, filling).numpy()
     out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(out, allow_pickle=False, **arrays)
     return read([out])
@@ -288,12 +283,10 @@ def make(folder: Path, out: Path, *, features: int, every: int, views: int, pair
 
 def read(paths: Sequence[Path]) -> Matches:
     """Read the problems of several files into one batch. A file's name is the name of its scene."""
-    files = [
-        {name: torch.from_numpy(x) for name, x in read_npz(path, OF_PAIRS + OF_PROBLEMS).items()} for path in paths
-    ]
-    one = {name: torch.cat([file[name] for file in files]) for name in OF_PROBLEMS}
-    for name in OF_PAIRS:
-        one[name] = pad_sequence([row for file in files for row in file[name]], batch_first=True)
+    files = [read_npz(path, OF_PAIRS + OF_PROBLEMS) for path in paths]
+    rows = {name: [torch.from_numpy(row) for file in files for row in file[name]] for name in OF_PAIRS}
+    one = {name: pad_sequence(x, batch_first=True) for name, x in rows.items()}
+    one |= {name: torch.from_numpy(np.concatenate([file[name] for file in files])) for name in OF_PROBLEMS}
     one |= {name: x.double() for name, x in one.items() if name != "mask"}
     pose, inliers = Pose(one["R"], one["t"]), one["mask"] & (one["error_px"] < INLIER_PX)
     problems = Problems(one["world"], one["pixels"], one["K"], pose, inliers)
@@ -313,18 +306,15 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
 
     A world far from its origin would lose digits in float32. Padding has the ratio 1.
     """
-    mask = matches.mask[at]
-    problems, longest = matches.problems.map(lambda x: x[at]), int(mask.sum(1).max())
+    problems, mask, ratio = take((matches.problems, matches.mask, matches.ratio), at)
     rotation, translation = problems.pose
     origin = (problems.world_points * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
-    moved = problems._replace(
-        world_points=(problems.world_points - origin[:, None])[:, :longest],
-        img_points=problems.img_points[:, :longest],
-        pose=Pose(rotation, translation + (rotation @ origin[..., None])[..., 0]),
-        inliers=problems.inliers[:, :longest],
-    )
-    given = moved.map(lambda x: x if x.dtype == torch.bool else x.float())
-    return (given, mask[:, :longest], matches.ratio[at].where(mask, 1.0)[:, :longest].float()), origin
+    pose = Pose(rotation, translation + (rotation @ origin[..., None])[..., 0])
+    of_pairs = problems.world_points - origin[:, None], problems.img_points, problems.inliers, ratio.where(mask, 1.0)
+    longest = int(mask.sum(1).max())
+    world, img, inliers, ratio, mask = (x[:, :longest] for x in (*of_pairs, mask))
+    given = (Problems(world, img, problems.intrinsics, pose, inliers), mask, ratio)
+    return map_tensors(lambda x: x if x.dtype == torch.bool else x.float(), given), origin
 
 
 def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
@@ -350,7 +340,7 @@ def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int) -> dict
     """Solve all problems that count with all solvers, which take turns on each batch."""
     found = {}
     for spec in solvers:
-        pose, ok = Pose(*map(torch.zeros_like, matches.problems.pose)), torch.zeros_like(matches.counts)
+        pose, ok = map_tensors(torch.zeros_like, (matches.problems.pose, matches.counts))
         found[spec] = Solved(pose, ok, *torch.full((2, len(ok)), torch.nan, dtype=torch.float64))
     parts = batches(matches, size)
     for number, at in enumerate(parts):
@@ -462,9 +452,9 @@ def draw_failure(matches: Matches, solved: Solved, at: int, folder: Path) -> dic
 
     The picture has pixels and projections, no photograph.
     """
-    mask, problem = matches.mask[at], matches.problems.map(lambda x: x[at])
+    mask, problem = matches.mask[at], take(matches.problems, torch.tensor(at))
     world, pixels = problem.world_points[mask], problem.img_points[mask]
-    poses = {"reference pose": problem.pose, "pose that was found": Pose(*(x[at] for x in solved.pose))}
+    poses = {"reference pose": problem.pose, "pose that was found": take(solved.pose, torch.tensor(at))}
     figure = make_figure(WIDTH, 3.1)
     panels, fits = figure.subplots(1, 2, sharex=True, sharey=True), []
     for axes, (title, pose) in zip(panels, poses.items(), strict=True):
@@ -510,18 +500,11 @@ def format_results(results: Mapping[str, Any]) -> str:
     def cell(row: Row) -> str:
         return f"{100 * row['success']:.1f}, {row['ms_per_problem']:.2f} ms" if row["count"] else "–"
 
-    return "\n\n".join(
-        pivot(
-            [row for row in results["rows"] if row["kind"] == kind],
-            {kind: "`{solver}`, calls of {batch}"},
-            columns,
-            cell,
-            by="group",
-            pad=True,
-        )
-        for columns in (["all", *BY_SHARE], scenes)
-        for kind in KINDS
-    )
+    tables = []
+    for columns, kind in itertools.product((["all", *BY_SHARE], scenes), KINDS):
+        rows = [row for row in results["rows"] if row["kind"] == kind]
+        tables.append(pivot(rows, {kind: "`{solver}`, calls of {batch}"}, columns, cell, by="group", pad=True))
+    return "\n\n".join(tables)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -550,8 +533,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measuring.add_argument("--batch", type=int, nargs="+", default=[BATCH], help="problems in a call of ours")
     options = command.parse_args(arguments)
     if options.command == "make":
-        making_options = {key: value for key, value in vars(options).items() if key != "command"}
-        print(*describe(make(**making_options)), sep="\n")
+        del options.command
+        print(*describe(make(**vars(options))), sep="\n")
         return
     matches = read(options.problems)
     settings: dict[str, Any] = {"files": [path.name for path in options.problems], "solvers": options.solvers}

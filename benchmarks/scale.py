@@ -6,8 +6,6 @@ is killed, and a run that is killed as a whole and repeated. Compares the result
 problem. Writes ``scale.json``.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys
@@ -127,11 +125,6 @@ def compare(expected: dict[str, np.ndarray], folder: Path) -> dict[str, int]:
     return counts
 
 
-def size(folder: Path) -> int:
-    """Bytes of the Parquet files of a folder."""
-    return sum(path.stat().st_size for path in folder.glob("*.parquet"))
-
-
 def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, Any]:
     """Draw the problems, and solve them in all ways."""
     draw(folder / "few", FEW)
@@ -158,7 +151,8 @@ def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, A
     return {
         **{"problems": problems, "pairs": PAIRS, "solver": solver, "batch": batch, "cores": os.cpu_count()},
         "ok": int(expected["ok"].sum()),
-        **{f"{name}_bytes": size(folder / part) for name, part in (("problem", "problems"), ("result", "loop"))},
+        "problem_bytes": sum(path.stat().st_size for path in (folder / "problems").glob("*.parquet")),
+        "result_bytes": sum(path.stat().st_size for path in (folder / "loop").glob("*.parquet")),
         "runs": runs,
         "differences": {name: compare(expected, folder / name) for name in ("one", "two", "killed", "again")},
     }

@@ -4,9 +4,8 @@ All solvers solve the same problems of the protocol's data in the same run, on o
 describes the measurements.
 """
 
-from __future__ import annotations
-
 import argparse
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -59,11 +58,6 @@ def draw(name: str, count: int) -> Problems:
     return draw_problems(source, count)
 
 
-def base_name(spec: str) -> str:
-    """The name of a solver without its options."""
-    return spec.partition(":")[0]
-
-
 @torch.no_grad()
 def measure_set(solvers: Mapping[str, nn.Module], name: str, count: int, repeats: int) -> list[dict[str, Any]]:
     """Time the solvers on one set, each solver once in a round, and measure success."""
@@ -82,14 +76,18 @@ def measure_set(solvers: Mapping[str, nn.Module], name: str, count: int, repeats
 def speedups(rows: Sequence[harness.Row]) -> list[dict[str, Any]]:
     """Every target of speed on every small set on which both sides were measured."""
     found = []
-    for mine in rows:
-        for theirs in rows:
-            wanted = SPEEDUPS.get((base_name(mine["solver"]), base_name(theirs["solver"])))
-            if wanted and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
-                times = harness.ratio(mine, theirs)
-                entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
-                found.append({**entry, "target": wanted, "met": times >= wanted})
+    for mine, theirs in itertools.product(rows, repeat=2):
+        wanted = SPEEDUPS.get((base_name(mine["solver"]), base_name(theirs["solver"])))
+        if wanted and mine["set"] == theirs["set"] and SETS[mine["set"]][0] == SMALL:
+            times = harness.ratio(mine, theirs)
+            entry = {"solver": mine["solver"], "peer": theirs["solver"], "set": mine["set"], "ratio": times}
+            found.append({**entry, "target": wanted, "met": times >= wanted})
     return found
+
+
+def base_name(spec: str) -> str:
+    """The name of a solver without its options."""
+    return spec.partition(":")[0]
 
 
 def memory_here(spec: str, count: int) -> dict[str, int]:
@@ -136,16 +134,9 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
 
 def targets(results: harness.Row) -> list[dict[str, Any]]:
     """The targets of speed and of memory beside the measurements."""
-    found = [
-        harness.target(
-            "`{solver}` beside `{peer}`, {set}".format_map(x),
-            x["ratio"],
-            x["target"],
-            unit="times as fast",
-            at_most=False,
-        )
-        for x in results["speedups"]
-    ]
+    options: Any = {"unit": "times as fast", "at_most": False}
+    what = "`{solver}` beside `{peer}`, {set}"
+    found = [harness.target(what.format_map(x), x["ratio"], x["target"], **options) for x in results["speedups"]]
     for entry in results["memory"]:
         peak, rise, wanted = (entry[f"{key}_bytes"] / 2**30 for key in ("peak", "rise", "target"))
         what = "Memory of `{solver}`, {count} problems, {set}".format_map(entry)

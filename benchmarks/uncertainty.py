@@ -5,8 +5,6 @@
 The page says what is measured.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time
@@ -25,21 +23,20 @@ from torch import Tensor, nn
 
 from kornia_pnpnet import (
     PnPNet,
-    PnPResult,
     PosePrior,
     RobustWeightedLM,
     create_solver,
     gravity_prior,
     pose_covariance,
     pose_errors,
-    success,
 )
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.points import BoxPoints
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.metrics import success
 from kornia_pnpnet.peers import OpenCVPnP, PeerSolver, PoseLib
 from kornia_pnpnet.refine.residual import retract
-from kornia_pnpnet.result import Pose, Problems
+from kornia_pnpnet.result import PnPResult, Pose, Problems
 
 SOLVER = "pnpnet-set"
 # Used for nothing else.
@@ -51,10 +48,9 @@ SIZES, SHARES = (10, 30, 50, 110), (0.0, 0.3, 0.5)
 THRESHOLD = 20.0
 #: Solvers of other libraries. The first two take no outliers.
 PEERS: dict[str, Callable[[], PeerSolver]] = {
-    "EPnP": lambda: OpenCVPnP(method="EPNP"),
-    "SQPnP": lambda: OpenCVPnP(method="SQPNP"),
-    "PoseLib": lambda: PoseLib(threshold=THRESHOLD),
+    name: partial(OpenCVPnP, method=name.upper()) for name in ("EPnP", "SQPnP")
 }
+PEERS["PoseLib"] = partial(PoseLib, threshold=THRESHOLD)
 #: For covariances of poses and for priors: number of pairs, and number of outliers among them.
 CREDIBLE = ((9, 0), (9, 2), (9, 4), (20, 0), (20, 10), (50, 0), (50, 25), (200, 0), (200, 100))
 FEW = ((3, 0), (4, 0), (4, 1), (5, 1), (6, 0), (6, 2), (9, 3), (12, 4))
@@ -115,15 +111,6 @@ def _noise(sigma: Tensor, size: int, generator: torch.Generator, *, turned: bool
     return (factor @ normal[..., size:])[..., 0], factor @ factor.mT
 
 
-def sigmas_of_same_trace(problems: Problems) -> dict[str, Tensor]:
-    """Standard deviations (B, N) of isotropic noise with the traces of the covariances, as arguments of a solver."""
-    return {
-        f"{name}_sigma": covariance.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt()
-        for name, covariance in (("img", problems.img_cov), ("world", problems.world_cov))
-        if covariance is not None
-    }
-
-
 def last_pose(problems: Problems, generator: torch.Generator, wrong: float) -> PosePrior:
     """The pose of the frame before, with ``wrong`` additional standard deviations of error."""
     distance = problems.pose.translation.norm(dim=-1, keepdim=True)
@@ -170,11 +157,6 @@ def draw(n: int, outliers: int, count: int, seed: int, **options: Any) -> Proble
     return SyntheticProblems(n=n, **options).batch(0)
 
 
-def success_share(result: PnPResult, problems: Problems) -> float | None:
-    """Share of the problems that are solved."""
-    return share(success(pose_errors(result.pose, problems.pose)))
-
-
 def medians(result: PnPResult, problems: Problems) -> Tensor:
     """Median rotation and translation error."""
     return torch.stack(list(pose_errors(result.pose, problems.pose))).median(1).values
@@ -188,9 +170,11 @@ def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     rows = []
     for turned, n, outliers in itertools.product((False, True), SIZES, SHARES):
         problems = uncertain_pnp(n, outliers, count, turned=turned, seed=SEED)
+        covariances: dict[str, Any] = {"img": problems.img_cov, "world": problems.world_cov}
+        of_same_trace = {f"{k}_sigma": x.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt() for k, x in covariances.items()}
         answers = {
             "covariances": solver(*problems[:3], **problems.known),
-            "sigmas": solver(*problems[:3], **sigmas_of_same_trace(problems)),
+            "sigmas": solver(*problems[:3], **of_same_trace),
             "nothing": solver(*problems[:3]),
             **{name: peer(*problems[:3]) for name, peer in peers.items()},
         }
@@ -242,11 +226,12 @@ def measure_priors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
             priors[f"{name}, wrong" if wrong else name] = make(problems, generator, wrong)
         row: dict[str, Any] = {"n": n, "outliers": outliers}
         for name, prior in priors.items():
-            row[name] = success_share(solver(*problems[:3], **sigmas, prior=prior), problems)
+            known: dict[str, Any] = {**sigmas, "prior": prior}
+            results = {name: solver(*problems[:3], **known)}
             if "wrong" not in name:
-                known: dict[str, Any] = {**sigmas, "prior": prior, "init": problems.pose}
-                best = bound(*problems[:3], problems.inliers.double(), **known)
-                row[f"{name}, bound"] = success_share(best, problems)
+                weights = problems.inliers.double()
+                results[f"{name}, bound"] = bound(*problems[:3], weights, **known, init=problems.pose)
+            row |= {key: share(success(pose_errors(x.pose, problems.pose))) for key, x in results.items()}
         rows.append(row)
     return rows
 
@@ -303,18 +288,13 @@ def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
             "sigmas": {"img_sigma": torch.full((BATCH,), 1.0), "world_sigma": torch.full((BATCH,), 0.05)},
             "covariances": problems.known,
         }
-        timers = {name: partial(us_per_problem, solver, problems, known) for name, known in given.items()}
+        calls = {name: partial(solver, *problems[:3], **known) for name, known in given.items()}
+        timers = {name: partial(harness.seconds, call, clock=time.process_time) for name, call in calls.items()}
         harness.in_turns(timers, 2)  # to warm up
-        times = {name: harness.summary(rounds) for name, rounds in harness.in_turns(timers, ROUNDS).items()}
+        rounds = harness.in_turns(timers, ROUNDS).items()
+        times = {name: harness.summary([1e6 * x / BATCH for x in seconds]) for name, seconds in rounds}
         rows.append({"n": n, **times, "ratio": harness.ratio(times["sigmas"], times["covariances"])})
     return rows
-
-
-def us_per_problem(solver: nn.Module, problems: Problems, known: dict[str, Any]) -> float:
-    """Processor time of a call, in microseconds per problem."""
-    start = time.process_time()
-    solver(*problems[:3], **known)
-    return 1e6 * (time.process_time() - start) / BATCH
 
 
 def targets(results: harness.Row) -> list[dict[str, Any]]:

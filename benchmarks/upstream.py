@@ -13,8 +13,6 @@ The patched function runs in float32 in calls of 100 problems, OpenCV problem by
 thread.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

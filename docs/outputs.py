@@ -3,8 +3,6 @@
 The ``python`` blocks of a page run one after the other. A ``text`` block below a ``python`` block holds what it prints.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -22,10 +22,8 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
 sys.path.insert(0, str(FOLDER))  # the benchmarks are scripts and import each other
-NAMES = ("contenders", "gpu", "harness", "page", "performance", "process", "solvers", "timing")
-contenders, gpu, harness, page, performance, process, benchmark, timing = (
-    importlib.import_module(name) for name in NAMES
-)
+NAMES = ("contenders", "gpu", "harness", "page", "performance", "process", "solvers")
+contenders, gpu, harness, page, performance, process, benchmark = (importlib.import_module(name) for name in NAMES)
 
 
 @pytest.fixture
@@ -150,7 +148,7 @@ def measured(tmp_path_factory):
         request = json.loads(arguments[-1])
         if script.name == "process.py":
             return process.main(request)
-        settings = contenders.Settings(**request["settings"])
+        settings = performance.Settings(**request["settings"])
         return json.loads(json.dumps(performance.measure_threads(request["part"], settings, request["count"])))
 
     with pytest.MonkeyPatch.context() as patch:
@@ -163,8 +161,8 @@ def measured(tmp_path_factory):
 def test_throughput_and_latency_have_a_row_for_every_point(measured):
     throughput, latency = (measured[1][part] for part in ("throughput", "latency"))
     rows = {(row["contender"], row["threads"], row["mode"], row["n"], row["batch"]) for row in throughput["rows"]}
-    small, large = contenders.QUICK.batches
-    forward = [(1, "forward", 6, contenders.QUICK.problems), (2, "forward", 9, large)]
+    small, large = performance.QUICK.batches
+    forward = [(1, "forward", 6, performance.QUICK.problems), (2, "forward", 9, large)]
     forward += [(1, "forward", 9, batch) for batch in (small, large)]
     backward = [(threads, "forward+backward", 9, batch) for threads, batch in ((1, small), (1, large), (2, large))]
     expected = {(name, *point) for name in SMALL for point in forward}

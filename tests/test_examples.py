@@ -1,12 +1,14 @@
 """The examples of the documentation run, and their results support the page."""
 
 import json
+import re
 import runpy
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -31,6 +33,43 @@ def _examples(monkeypatch):
 @pytest.fixture
 def hall():
     return pytest.importorskip("rendered_hall")
+
+
+def printed(tmp_path, name, *arguments):
+    """What a short program prints."""
+    command = [sys.executable, EXAMPLES / f"{name}.py", *map(str, arguments)]
+    return subprocess.run(command, check=True, cwd=tmp_path, stdout=subprocess.PIPE, text=True).stdout
+
+
+def test_your_data_are_evaluated_with_and_without_padding_and_poselib(tmp_path, monkeypatch):
+    """Without PoseLib one line says what is missing."""
+    (tmp_path / "poselib.py").write_text("raise ImportError")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+    shown = printed(tmp_path, "evaluate_your_data")
+    rows = {line.split()[0]: line for line in shown.splitlines()[2:]}
+    assert "left out: " in rows["poselib"]
+    assert all(float(rows[name].split()[1]) > 90.0 for name in ("pnpnet-set", "p3p-ransac"))
+    arrays = dict(np.load(tmp_path / "outputs" / "examples" / "pairs.npz"))
+    arrays["mask"] = np.arange(50) < np.arange(500)[:, None] % 20 + 30
+    arrays["img_points"][~arrays["mask"]] = 0.0
+    np.savez(tmp_path / "padded.npz", **arrays)
+    assert "40 pairs on average" in printed(tmp_path, "evaluate_your_data", "padded.npz")
+
+
+@pytest.mark.slow
+def test_one_photo_is_localised(tmp_path):
+    pytest.importorskip("cv2")
+    shown = printed(tmp_path, "localise_photo")
+    assert "ok: True" in shown
+    assert float(re.search(r"([\d.]+) cm", shown)[1]) < 5.0
+
+
+@pytest.mark.slow
+def test_a_sweep_is_read_from_its_table_and_continued(tmp_path):
+    pytest.importorskip("hydra")
+    small = ("--updates", 2, "model.n=6", "validation_size=200")
+    assert "best: model.n=6, validation_size=200, model.m=1" in printed(tmp_path, "sweep", *small, "model.m=1")
+    assert "of the 1 others" in printed(tmp_path, "sweep", *small, "model.m=1,2")
 
 
 @pytest.mark.slow

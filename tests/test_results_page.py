@@ -14,7 +14,7 @@ pytest.importorskip("jinja2")
 sys.path.append(str(Path(__file__).resolve().parents[1] / "docs" / "results"))
 import matches
 import render
-import short_runs
+from rates import compared
 
 
 def row(rate, *, half=1.0, **columns):
@@ -82,6 +82,6 @@ def test_runs_are_apart_only_when_all_their_intervals_are():
         ([75.0], [70.0, 74.0], "+3.0", "overlap"),  # one seed of the others comes near
         ([75.0, 71.0], [70.0], "+3.0", "overlap"),
     ):
-        found = short_runs.compared([row(rate) for rate in rates], [row(rate) for rate in others], "none")
+        found = compared([row(rate) for rate in rates], [row(rate) for rate in others], "none")
         assert found.startswith(difference)
         assert verdict in found

@@ -1,12 +1,9 @@
 """A ChArUco board, detected by OpenCV, with corners mislabelled: ``python docs/examples/fiducial_board.py``.
 
-A camera circles over a board, which is drawn in perspective, blurred and noisy. OpenCV finds the corners and their
-numbers; a share of the corners then gets the number of another corner, as happens when markers are misread.
-`pnpnet-set` and `cv2.solvePnPRansac` solve for the pose from the same corners. Writes `fiducial_board.json` and
-`fiducial_board.png` to `--out`.
+A camera circles over a drawn board. OpenCV finds the corners and their numbers; a share of the corners then gets the
+number of another corner, as happens when markers are misread. `pnpnet-set` and `cv2.solvePnPRansac` solve for the pose
+from the same corners. Writes `fiducial_board.json` and `fiducial_board.png` to `--out`.
 """
-
-from __future__ import annotations
 
 import math
 from typing import Any
@@ -57,9 +54,9 @@ def photograph(board: Any, rotation: np.ndarray, place: np.ndarray, rng: np.rand
 def mislabelled(numbers: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
     """The numbers of the corners with a share of them exchanged among each other."""
     wrong = rng.permutation(len(numbers))[: round(share * len(numbers))]
-    numbers = numbers.copy()
-    numbers[wrong] = numbers[np.roll(wrong, 1)]
-    return numbers
+    labels = numbers.copy()
+    labels[wrong] = numbers[np.roll(wrong, 1)]
+    return labels
 
 
 def main() -> None:

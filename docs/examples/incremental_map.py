@@ -6,8 +6,6 @@ and triangulates new points, with `cv2.solvePnPRansac` or with `pnpnet-set`; bot
 the end all images are registered again to the whole map. Writes `incremental_map.json` to `--out`.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -6,14 +6,13 @@ through a differentiable solver: this package's `pnpnet-set`, its EPnP without w
 error of the offsets after every step. Writes `keypoint_offsets.json` and a picture of it to `--out`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
-from shared import command, dlt, write
+from kornia.geometry import solve_pnp_dlt
+from shared import command, write
 from torch import Tensor
 
 from kornia_pnpnet import create_solver
@@ -43,8 +42,8 @@ def ours(name: str) -> Solve:
 
 def kornias_dlt(*inputs: Tensor) -> tuple[Pose, Tensor]:
     """Kornia's; what is not finite does not count."""
-    pose = dlt(*inputs)
-    return pose, pose.matrix.detach().isfinite().all(-1).all(-1)
+    found = solve_pnp_dlt(*inputs)
+    return Pose(found[..., :3], found[..., 3]), found.detach().isfinite().all(-1).all(-1)
 
 
 SOLVERS: dict[str, Solve] = {"pnpnet-set": ours("pnpnet-set"), "epnp": ours("epnp"), "kornia-dlt": kornias_dlt}

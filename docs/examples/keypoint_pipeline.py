@@ -1,31 +1,27 @@
 """From images to poses, trained end to end: ``python docs/examples/keypoint_pipeline.py``.
 
-A textured box is rendered under random poses, before a random background, behind occluders, blurred and noisy. A small
-network finds its 14 keypoints (Kornia's spatial softmax and expectation) and predicts a standard deviation for each;
-`PnPNet` makes a pose of them. First the network learns from labels of the visible keypoints, as people make them; more
-than half of the keypoints are hidden. Then copies of it train as long again in the ways of :data:`WAYS`: with the
-keypoint loss alone; also with the likelihood of the labels, which teaches the standard deviations without a pose; or
-end to end, with the loss of the pose, whose gradient comes through the solver. Two more networks learn from labels of
-all keypoints, which only a known pose can give. All are tested with the same solver on new images. The solver gets the
-standard deviations where a network has learned them; the network that was trained end to end is also tested without.
-Writes `keypoint_pipeline.json` and pictures to `--out`.
+A textured box is rendered in random poses, behind occluders, blurred and noisy. A small network finds its 14 keypoints
+(Kornia's spatial softmax and expectation) and predicts a standard deviation for each; `pnpnet-set` makes a pose of
+them. The network learns from labels of the visible keypoints, less than half of all. Copies of it then train as long
+again in the ways of :data:`WAYS`: with the keypoint loss alone; with the likelihood of the labels, too, which teaches
+the standard deviations without a pose; or with the loss of the pose, whose gradient comes through the solver. Two more
+networks have labels of all keypoints, which only a known pose can give. All are tested with the same solver on new
+images. Writes `keypoint_pipeline.json` and pictures to `--out`.
 
-``--covariances`` runs another, shorter experiment. Each image is also blurred along one direction, as by a camera in
-motion, so that a keypoint is less exact along the blur than across it; there are no occluders. Copies of one network
-are trained end to end and by the likelihood of the labels. They predict the noise of each keypoint in three ways: a
-standard deviation; a 2×2 covariance; or a factor of the covariance of the keypoint's heat map. Writes
+``--covariances`` runs another, shorter experiment without occluders: motion blurs each image along one direction, in
+which keypoints are less exact. Copies of one network train end to end and by likelihood. They predict the noise of a
+keypoint as a standard deviation, as a covariance, or as a factor of the covariance of the keypoint's heat map. Writes
 `keypoint_covariances.json` to `--out`.
 """
-
-from __future__ import annotations
 
 import copy
 import math
 import multiprocessing
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from kornia.filters import gaussian_blur2d, motion_blur
@@ -56,13 +52,13 @@ TEST_SEED = 999_983  # of images that no training uses
 ALONE, END, WITHOUT_SIGMA = "keypoint loss alone", "end to end", "end to end, not told how far off"
 FULL = "keypoint loss alone, hidden ones labelled"
 LIKELY, FULL_LIKELY = f"{ALONE}, how far off by likelihood", f"{FULL}, how far off by likelihood"
-#: Arguments of :func:`train` by the name of a network.
-WAYS: dict[str, dict[str, bool]] = {
-    ALONE: {},
-    END: {"end_to_end": True},
-    LIKELY: {"likelihood": True},
-    FULL: {"hidden": True},
-    FULL_LIKELY: {"hidden": True, "likelihood": True},
+#: Ways of :func:`train` by the name of a network.
+WAYS: dict[str, tuple[str, ...]] = {
+    ALONE: (),
+    END: ("end to end",),
+    LIKELY: ("likelihood",),
+    FULL: ("hidden",),
+    FULL_LIKELY: ("hidden", "likelihood"),
 }
 #: The noise of a keypoint, as a network predicts it.
 SIGMA, COVARIANCE, HEAT_MAP = "standard deviation", "covariance", "covariance of the heat map times a factor"
@@ -167,7 +163,7 @@ class Keypoints(nn.Module):
         self.noise = SIGMA
         self.to(memory_format=torch.channels_last)  # faster on CPUs
 
-    def predict(self, noise: str) -> Keypoints:
+    def predict(self, noise: str) -> Self:
         """Predict another kind of noise from now on; covariances begin as multiples of the identity."""
         self.noise = noise
         if noise == COVARIANCE:
@@ -220,20 +216,12 @@ def surprise(off: Tensor, noise: Tensor) -> Tensor:
 
 
 def train(
-    network: Keypoints,
-    solver: nn.Module,
-    seed: int,
-    updates: range,
-    *,
-    end_to_end: bool = False,
-    hidden: bool = False,
-    likelihood: bool = False,
-    motion: bool = False,
+    network: Keypoints, solver: nn.Module, seed: int, updates: range, way: Sequence[str] = (), *, motion: bool = False
 ) -> dict[str, list[float]]:
     """Train a network on the batches ``updates`` of a seed, and return its curves.
 
-    The loss is that of the keypoints; with ``end_to_end`` also that of the pose, and with ``likelihood`` also that of
-    the noise, from which keypoints get no gradient. With ``hidden`` the hidden keypoints have labels, too.
+    The loss is that of the keypoints; the way "end to end" adds that of the pose, and "likelihood" that of the noise,
+    from which keypoints get no gradient. In the way "hidden" the hidden keypoints have labels, too.
     """
     log: list[list[float]] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
@@ -242,12 +230,12 @@ def train(
         problem = draw(seed, index, motion=motion)
         pixels, noise = network(problem.images)
         off = functional.smooth_l1_loss(pixels, problem.pixels, reduction="none").mean(-1)
-        labelled = torch.ones_like(problem.visible) if hidden else problem.visible
+        labelled = torch.ones_like(problem.visible) if "hidden" in way else problem.visible
         loss = (off * labelled).sum() / labelled.sum()
         terms = [loss.item()]
-        if likelihood:
+        if "likelihood" in way:
             loss = loss + (surprise((pixels - problem.pixels).detach(), noise) * labelled).sum() / labelled.sum()
-        if end_to_end:
+        if "end to end" in way:
             result = solve(solver, pixels, noise)
             error = distance(result.pose, problem.pose)
             counts = result.ok & (error.detach() < 10.0 * MOST)
@@ -301,9 +289,9 @@ def run(seed: int, updates: int, batches: int) -> tuple[dict[str, Any], dict[str
     solver, untrained, start, found = begin(seed, updates, motion=False, effort="fixed")
     networks = {}
     for name, way in WAYS.items():
-        networks[name] = network = copy.deepcopy(untrained if way.get("hidden") else start)
-        for first in (0, updates) if way.get("hidden") else (updates,):
-            curves = train(network, solver, seed, range(first, first + updates), **way)
+        networks[name] = network = copy.deepcopy(untrained if "hidden" in way else start)
+        for first in (0, updates) if "hidden" in way else (updates,):
+            curves = train(network, solver, seed, range(first, first + updates), way)
         with_sigma = name not in (ALONE, FULL)
         found[name] = {"curves": curves, **test(network, solver, with_sigma=with_sigma, batches=batches, motion=False)}
         distances = ", ".join(f"{key} {found[name][key]:.4f}" for key in ("mean_distance", "median_distance"))
@@ -318,7 +306,7 @@ def run_covariances(seed: int, updates: int, batches: int) -> tuple[dict[str, An
     more = range(updates, updates + updates // 2)
     for noise in (SIGMA, COVARIANCE, HEAT_MAP):
         network = copy.deepcopy(start).predict(noise)
-        curves = train(network, solver, seed, more, end_to_end=True, likelihood=True, motion=True)
+        curves = train(network, solver, seed, more, ("end to end", "likelihood"), motion=True)
         found[noise] = {"curves": curves, **test(network, solver, with_sigma=True, batches=batches, motion=True)}
         print(f"seed {seed}, {noise}: mean_distance {found[noise]['mean_distance']:.4f}", flush=True)
     return found, {}

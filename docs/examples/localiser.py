@@ -2,23 +2,19 @@
 
 Every fifth image of the model is a query whose observations are ignored, the others are the map. Kornia finds features
 in all images; a feature of the map that lies on an observation of the model gets its point. Each query is matched with
-the images of the map that look most like it. The scores of the matches become confidences, and ``pnpnet-set`` solves
-the queries in batches, from the likeliest pairs of each. COLMAP's estimator (pycolmap) gets the same pairs, those that
-pass the ratio test, and all matches, one query after the other.
-
-The confidences are fitted on images of the map: they are matched with the rest of the map, and the poses of the model
-tell which matches are inliers.
+the images of the map that look most like it. Scores of matches become confidences, which are fitted on matches between
+images of the map. ``pnpnet-set`` solves the queries in batches, from the likeliest pairs of each. COLMAP's estimator
+(pycolmap) gets the same pairs, those that pass the ratio test, and all matches, one query after the other.
 
 Without ``--images`` and ``--model`` a hall is rendered first (``rendered_hall.py``). ``--features disk`` takes Kornia's
 DISK and LightGlue, whose weights Kornia downloads unless they are in the cache of ``torch.hub``. Writes
-``localiser.json`` with all poses and errors, and the picture ``localiser.png``.
+``localiser.json`` with all errors, and the picture ``localiser.png``. ``localise_photo.py`` is the same in short.
 """
-
-from __future__ import annotations
 
 import tempfile
 import time
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,15 +23,8 @@ import numpy as np
 import pycolmap
 import rendered_hall
 import torch
-from kornia.feature import (
-    DISK,
-    LightGlueMatcher,
-    SIFTFeatureScaleSpace,
-    get_laf_center,
-    laf_from_center_scale_ori,
-    laf_is_filled,
-    match_snn,
-)
+from kornia.feature import DISK, LightGlueMatcher, SIFTFeatureScaleSpace, laf_from_center_scale_ori, match_snn
+from kornia.feature.laf import get_laf_center, laf_is_filled
 from shared import command, pose_error, write
 from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
@@ -190,25 +179,20 @@ def fit_scores(references: Sequence[Photo], detector: Detector) -> IsotonicRegre
     return calibration.fit(torch.cat(scores).numpy(), torch.cat(inliers).numpy())
 
 
-def choose(matches: Matches, calibration: IsotonicRegression) -> tuple[Matches, Tensor]:
-    """The likeliest pairs of a query, and their confidences."""
+def choose(matches: Matches, calibration: IsotonicRegression) -> Matches:
+    """The likeliest pairs of a query, with confidences as their scores."""
     confidence = torch.from_numpy(calibration.predict(matches.scores.numpy()))
     top = confidence.topk(min(MOST_PAIRS, len(confidence))).indices
-    return Matches(*(x[top] for x in matches)), confidence[top]
+    return Matches(*(x[top] for x in matches[:2]), confidence[top])
 
 
-def solve(
-    solver: nn.Module, photos: Sequence[Photo], matches: Sequence[Matches], confidences: Sequence[Tensor], batch: int
-) -> PnPResult:
-    """Solve queries in batches, padded to the same number of pairs."""
-    masks = [torch.ones_like(x, dtype=torch.bool) for x in confidences]
-    lists = [m.world_points for m in matches], [m.img_points for m in matches], masks, confidences
-    world, img, mask, confidence = (pad_sequence(list(x), batch_first=True) for x in lists)
-    inputs = world, img, torch.stack([photo.intrinsics for photo in photos]), mask, confidence
-    with torch.no_grad():
-        parts = zip(*(x.split(batch) for x in inputs), strict=True)
-        results = [solver(*pairs, mask=mask, confidence=confidence) for *pairs, mask, confidence in parts]
-    return map_tensors(lambda *x: torch.cat(x), *results)
+@torch.no_grad()
+def solve(solver: nn.Module, photos: Sequence[Photo], chosen: Sequence[Matches], batch: int) -> PnPResult:
+    """Solve queries in batches, padded with pairs without confidence."""
+    world, img, confidence = (pad_sequence(list(x), batch_first=True) for x in zip(*chosen, strict=True))
+    inputs = world, img, torch.stack([photo.intrinsics for photo in photos]), confidence
+    parts = zip(*(x.split(batch) for x in inputs), strict=True)
+    return map_tensors(lambda *x: torch.cat(x), *(solver(*p, mask=c > 0, confidence=c) for *p, c in parts))
 
 
 def solve_by_colmap(photos: Sequence[Photo], matches: Sequence[Matches]) -> tuple[Pose, Tensor]:
@@ -228,8 +212,7 @@ def solve_by_colmap(photos: Sequence[Photo], matches: Sequence[Matches]) -> tupl
 
 def errors(pose: Pose, found: Tensor, photos: Sequence[Photo], metre: float) -> list[dict[str, float] | None]:
     """Distance of the cameras in metres and angle of the rotations in degrees; None without a pose."""
-    truth = Pose(*(torch.stack(x) for x in zip(*(photo.pose for photo in photos), strict=True)))
-    distance, angle = pose_error(pose, truth)
+    distance, angle = pose_error(pose, map_tensors(lambda *x: torch.stack(x), *(photo.pose for photo in photos)))
     rows = zip((distance * metre).tolist(), angle.tolist(), found.tolist(), strict=True)
     return [{"metres": metres, "degrees": degrees} if there else None for metres, degrees, there in rows]
 
@@ -246,13 +229,10 @@ def run(
     images: Path, model: pycolmap.Reconstruction, detector: Detector, *, batch: int, metre: float
 ) -> tuple[dict[str, Any], list[tuple[Matches, Tensor, dict[str, Any]]]]:
     """Localise the queries of a model; the results, and of each query its pairs, which of them count, and its row."""
-    seconds: dict[str, float] = {}
-    clock = time.process_time()
+    marks = [("start", time.process_time())]
 
     def lap(stage: str) -> None:
-        nonlocal clock
-        now = time.process_time()
-        seconds[stage], clock = now - clock, now
+        marks.append((stage, time.process_time()))
 
     posed = sorted((x for x in model.images.values() if x.has_pose), key=lambda x: x.name)
     pointed = [x for x in posed if x.num_points3D]
@@ -272,12 +252,11 @@ def run(
     lap("retrieval")
     matched = [match(x, others, detector) for x, others in zip(photos, alike, strict=True)]
     lap("matching")
-    chosen = [choose(x, calibration) for x in matched]
+    kept = [choose(x, calibration) for x in matched]
     lap("confidence")
-    kept, confidences = (list(x) for x in zip(*chosen, strict=True))
-    solve(solver, photos[:1], kept[:1], confidences[:1], batch)  # the first call of a process takes longer
+    solve(solver, photos[:1], kept[:1], batch)  # the first call of a process takes longer
     lap("preparation")
-    result = solve(solver, photos, kept, confidences, batch)
+    result = solve(solver, photos, kept, batch)
     lap(OURS)
     found = {OURS: errors(result.pose, result.ok, photos, metre)}
     theirs = {"pycolmap, the same pairs": kept}
@@ -297,7 +276,7 @@ def run(
         row |= {"outliers": outlier.double().mean().item(), "outliers_of_all": of_all.double().mean().item()}
         rows.append(row | {name: of_queries[i] for name, of_queries in found.items()})
         drawn.append((kept[i], result.inliers[i, : len(outlier)], rows[-1]))
-    ms = {stage: 1000.0 * x / len(photos) for stage, x in seconds.items()}
+    ms = {stage: 1000.0 * (end - begin) / len(photos) for (_, begin), (stage, end) in pairwise(marks)}
     stages = {stage: ms[stage] for stage in ("features", "retrieval", "matching", "confidence")}
     solvers = {name: summary(x, ms[name]) for name, x in found.items()}
     settings = {"references": len(references), "matched_with": REFERENCES, "pairs": MOST_PAIRS, "batch": batch}

@@ -5,8 +5,6 @@ a loss on the pose of a solver has no useful gradient. The program therefore sta
 adds the loss on the pose when most poses are `ok`. Writes `pose_network.json` to `--out`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

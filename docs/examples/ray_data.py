@@ -8,8 +8,6 @@ With ``--id NAME``, a column of unique numbers, Ray writes down which problems a
 command then goes on where it was stopped. Without ``--id``, OUT must not exist.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import ray

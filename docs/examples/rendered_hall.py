@@ -5,8 +5,6 @@ The world is in metres, its z axis points up. A pose is world-to-camera, pixels 
 pixel is (0.5, 0.5)).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,7 +12,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import pycolmap
 import torch
 from numpy.typing import NDArray
 
@@ -22,8 +19,6 @@ from kornia_pnpnet import Pose, depth_points
 
 Floats = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
-CAMERA = pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
-CAMERA.camera_id = 1
 INTRINSICS = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
 DOWN = np.array([0.0, 0.0, -1.0])  # gravity
 SIZE = np.array([12.0, 9.0, 4.0])  # of the hall, in metres
@@ -51,9 +46,15 @@ class Plane(NamedTuple):
     texture: NDArray[np.uint8]
 
 
-def draw_shapes(drawn: NDArray[np.uint8], rng: np.random.Generator, density: float, largest: int) -> None:
-    """Draw ellipses and rectangles: their number on a square metre, and their largest size in texels."""
-    rows, columns = drawn.shape
+def make_texture(rng: np.random.Generator, width: float, height: float, tiles: Sequence[Any] = ()) -> NDArray[np.uint8]:
+    """A rectangle with sides in metres: shapes of all sizes, or tiles in a random order and a few shapes."""
+    rows, columns = round(height * TEXELS), round(width * TEXELS)
+    drawn = np.full((rows, columns), int(rng.integers(90, 170)), np.uint8)
+    density, largest = (6.0, 25) if tiles else (90.0, 40)  # shapes on a square metre, texels
+    if tiles:
+        step = len(tiles[0])
+        order = rng.integers(len(tiles), size=(-(-rows // step), -(-columns // step)))
+        drawn = np.block([[tiles[k] for k in row] for row in order])[:rows, :columns].copy()
     for _ in range(round(density * rows * columns / TEXELS**2)):
         x, y = int(rng.integers(columns)), int(rng.integers(rows))
         across, high = (int(s) for s in rng.integers(3, largest, 2))
@@ -62,17 +63,6 @@ def draw_shapes(drawn: NDArray[np.uint8], rng: np.random.Generator, density: flo
             cv2.ellipse(drawn, (x, y), (across, high), float(rng.uniform(0, 180)), 0, 360, shade, -1)
         else:
             cv2.rectangle(drawn, (x, y), (x + across, y + high), shade, -1)
-
-
-def make_texture(rng: np.random.Generator, width: float, height: float, tiles: Sequence[Any] = ()) -> NDArray[np.uint8]:
-    """A rectangle with sides in metres: shapes of all sizes, or tiles in a random order and a few shapes."""
-    rows, columns = round(height * TEXELS), round(width * TEXELS)
-    drawn = np.full((rows, columns), int(rng.integers(90, 170)), np.uint8)
-    if tiles:
-        step = len(tiles[0])
-        order = rng.integers(len(tiles), size=(-(-rows // step), -(-columns // step)))
-        drawn = np.block([[tiles[k] for k in row] for row in order])[:rows, :columns].copy()
-    draw_shapes(drawn, rng, *((6.0, 25) if tiles else (90.0, 40)))
     return cv2.GaussianBlur(drawn, (0, 0), 0.8)
 
 
@@ -99,22 +89,17 @@ def make_hall(seed: int = 0) -> list[Plane]:
     return planes
 
 
-def look_at(centre: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """The pose of a level camera that looks from a place to a target: rotation (3, 3), translation (3,)."""
+def photograph(hall: list[Plane], centre: Floats, target: Floats) -> View:
+    """Render what a level camera sees from a place to a target by casting rays: image and smallest depths."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(DOWN, forward)
     right /= np.linalg.norm(right)
     rotation = np.stack((right, np.cross(forward, right), forward))
-    return rotation, -rotation @ centre
-
-
-def photograph(hall: list[Plane], rotation: Floats, translation: Floats) -> View:
-    """Render one image by casting rays, and the smallest depth in each pixel."""
+    translation = -rotation @ centre
     size = np.array([WIDTH, HEIGHT]) * SUPERSAMPLING
     columns, rows = np.meshgrid(*((np.arange(n) + 0.5) / SUPERSAMPLING for n in size))
     rays = np.stack((columns, rows, np.ones_like(rows)), -1) @ np.linalg.inv(INTRINSICS).T @ rotation  # depth 1
     rays = rays.astype(np.float32)
-    centre = -rotation.T @ translation
     nearest = np.full(rays.shape[:2], np.inf, np.float32)
     image = np.zeros(rays.shape[:2], np.uint8)
     for corner, along, up, texture in hall:
@@ -156,8 +141,7 @@ def reference_views(hall: list[Plane], count: int, seed: int = 1) -> list[View]:
         centre = SIZE * [0.5, 0.5, 0.0] + round_trip * [4.2, 3.0, 0.0] + [0.0, 0.0, rng.uniform(1.5, 2.0)]
         across = turn + math.pi + math.radians(50.0) * (-1.0) ** i
         target = centre + 4.0 * np.array([math.cos(across), math.sin(across), rng.uniform(-0.25, 0.0)])
-        view = photograph(hall, *look_at(centre, target))
-        views.append(expose(view, rng, blur=0.6, noise=2.0, gain=1.0))
+        views.append(expose(photograph(hall, centre, target), rng, blur=0.6, noise=2.0, gain=1.0))
     return views
 
 
@@ -168,7 +152,7 @@ def query_views(hall: list[Plane], count: int, seed: int = 2) -> Iterator[View]:
         centre = rng.uniform([1.0, 1.0, 1.4], [*(SIZE[:2] - 1.0), 2.2])
         turn = rng.uniform(0.0, 2.0 * math.pi)
         target = centre + 4.0 * np.array([math.cos(turn), math.sin(turn), rng.uniform(-0.35, 0.1)])
-        view = photograph(hall, *look_at(centre, target))
+        view = photograph(hall, centre, target)
         yield expose(view, rng, blur=rng.uniform(0.5, 2.5), noise=rng.uniform(2.0, 16.0), gain=rng.uniform(0.2, 1.0))
 
 
@@ -178,19 +162,23 @@ def make_scene(folder: Path, references: int = 20, queries: int = 60, seed: int 
     The model's points are SIFT features of the reference images (`reference00.png` and so on) with their depths;
     the queries (`query00.png` and so on) only have poses.
     """
+    import pycolmap
+
     hall, sift = make_hall(seed), cv2.SIFT_create(nfeatures=FEATURES, enable_precise_upscale=True)
     views = {f"reference{i:02}.png": view for i, view in enumerate(reference_views(hall, references))}
     views |= {f"query{i:02}.png": view for i, view in enumerate(query_views(hall, queries))}
     for name in ("images", "sparse"):
         (folder / name).mkdir(parents=True)
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(CAMERA)
+    model, pinhole = pycolmap.Reconstruction(), [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    camera = pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=pinhole, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
     for i, (name, view) in enumerate(views.items(), start=1):
         cv2.imwrite(str(folder / "images" / name), view.image)
         found = sift.detect(view.image) if i <= references else []
         keypoints = np.array([x.pt for x in found], dtype=np.float64).reshape(-1, 2) + 0.5
         image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=1, image_id=i)
-        model.add_image_with_trivial_frame(image, rigid(view.rotation, view.translation))
+        pose = np.column_stack((view.rotation, view.translation))
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
         points = seen_points(view, keypoints)
         for k in np.flatnonzero(np.isfinite(points[:, 0])):
             track = pycolmap.Track()
@@ -221,6 +209,8 @@ def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
 
     The camera walks at 0.8 m/s, 30 frames per second, and shakes. Depths have 16 bits, 5000 per metre.
     """
+    import pycolmap
+
     hall, rng = make_hall(0), np.random.default_rng(seed)
     lines: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for kind in ("rgb", "depth"):
@@ -231,20 +221,15 @@ def write_sequence(folder: Path, frames: int = 100, seed: int = 3) -> Path:
         centre += 0.03 * np.sin(time * np.array([5.0, 7.0, 11.0]))
         ahead = turn + math.pi + 0.4 * math.sin(0.9 * time)
         target = centre + 4.0 * np.array([math.cos(ahead), math.sin(ahead), -0.1 + 0.03 * math.sin(9.0 * time)])
-        view = expose(photograph(hall, *look_at(centre, target)), rng, blur=1.0, noise=5.0, gain=0.8)
+        view = expose(photograph(hall, centre, target), rng, blur=1.0, noise=5.0, gain=0.8)
         near = np.where(view.depth < MAX_DEPTH, view.depth, 0.0)
         noise = depth_sigma(near) * rng.normal(size=near.shape)
         depth = np.where(near > 0, (near + noise) * 5000.0, 0.0).round().astype(np.uint16)
         for kind, image in (("rgb", view.image), ("depth", depth)):
             cv2.imwrite(str(folder / kind / f"{i:04}.png"), image)
             lines[kind].append(f"{time:.4f} {kind}/{i:04}.png")
-        place = rigid(view.rotation.T, centre)
-        lines["groundtruth"].append(" ".join(map(str, (f"{time:.4f}", *centre, *place.rotation.quat))))
+        turn = pycolmap.Rigid3d(np.column_stack((view.rotation.T, centre))).rotation.quat
+        lines["groundtruth"].append(" ".join(map(str, (f"{time:.4f}", *centre, *turn))))
     for kind, rows in lines.items():
         (folder / f"{kind}.txt").write_text("\n".join(rows) + "\n")
     return folder
-
-
-def rigid(rotation: Floats, translation: Floats) -> pycolmap.Rigid3d:
-    """A pose of pycolmap."""
-    return pycolmap.Rigid3d(np.column_stack((rotation, translation)))

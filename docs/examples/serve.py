@@ -4,8 +4,6 @@ Clients call a server at the same time. ``Server`` solves all waiting problems i
 clients that call the solver themselves, and with PyTorch's default number of threads. Writes `serve.json` to `--out`.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor

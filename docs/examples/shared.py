@@ -1,13 +1,10 @@
 """What the examples share: command lines, results files, and errors of poses."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any
 
 import torch
-from kornia.geometry import solve_pnp_dlt
 from torch import Tensor, nn
 
 from kornia_pnpnet import Pose, create_solver
@@ -43,9 +40,3 @@ def opencv(threshold: float) -> nn.Module:
     """``cv2.solvePnPRansac`` with a threshold in pixels and OpenCV's defaults, called like a solver of ours."""
     defaults = {"iterations": 100, "confidence": 0.99, "method": "ITERATIVE", "refine": False}
     return create_solver("opencv-ransac", threshold=threshold, **defaults)
-
-
-def dlt(world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> Pose:
-    """Poses by Kornia's ``solve_pnp_dlt``."""
-    found = solve_pnp_dlt(world_points, img_points, intrinsics.expand(len(world_points), 3, 3))
-    return Pose(found[..., :3], found[..., 3])

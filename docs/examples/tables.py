@@ -1,7 +1,5 @@
 """Write the tables of ``README.md`` and ``clients.md`` from the results: ``python docs/examples/tables.py``."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

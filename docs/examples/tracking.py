@@ -2,21 +2,18 @@
 
 FOLDER is an RGB-D sequence of the TUM benchmark (``rgb.txt``, ``depth.txt``, ``groundtruth.txt``). Every fifteenth
 frame is a keyframe: its features have points from its depth and its true pose. Each frame is matched with the last
-keyframe, and some of the matches go to the solver: alone, with the last pose as ``prior``, and with gravity, too. The
-direction of gravity is that of the true pose with noise of half a degree, as of an accelerometer; the z axis of the
-world points up, as in the benchmark.
+keyframe, and some of the matches go to the solver: alone, with the last pose as ``prior``, and with gravity, too.
+Gravity is that of the true pose with noise, as of an accelerometer; the z axis of the world points up.
 
 Without ``--sequence`` a walk through a hall is rendered first (``rendered_hall.py``). Writes ``tracking.json`` and
 ``tracking.png``.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,7 +119,7 @@ def depth_covariances(points: Tensor, camera: Pose) -> Tensor:
     return error[:, :, None] * error[:, None]
 
 
-def motion_prior(last: Pose, frames: int) -> PosePrior:
+def motion_prior(last: Pose, frames: int, _: Frame) -> PosePrior:
     """The last pose as a prior. Its uncertainty grows with the number of frames since then."""
     rotation, translation = last
     eye = torch.eye(3, dtype=rotation.dtype)
@@ -141,11 +138,6 @@ def with_gravity(prior: PosePrior, down: Tensor) -> PosePrior:
     turn = axis_angle_to_rotation_matrix((axis / axis.norm() * torch.atan2(axis.norm(), expected @ down))[None])
     pose = Pose(turn @ prior.pose.rotation, (turn @ prior.pose.translation[..., None])[..., 0])
     return PosePrior(pose, prior.information + gravity_prior(world_down[None], down[None], GRAVITY).information)
-
-
-def place(pose: Pose) -> list[float]:
-    """Where a camera is, to a tenth of a millimetre."""
-    return [round(x, 4) for x in centre(pose).tolist()]
 
 
 def track(
@@ -171,7 +163,7 @@ def track(
             last, since = pose, 1
         else:
             since += 1
-        path.append(place(last))
+        path.append(last)
         errors.append(torch.stack(pose_error(last, frame.pose)))
     metres, degrees = torch.stack(errors).numpy().T
     return {
@@ -180,8 +172,13 @@ def track(
         "median_m": float(np.median(metres)),
         "median_deg": float(np.median(degrees)),
         "ms": 1000.0 * float(np.median(seconds)),
-        "path": path,
+        "path": places(path),
     }
+
+
+def places(poses: Iterable[Pose]) -> list[list[float]]:
+    """Where cameras are, to a tenth of a millimetre."""
+    return [[round(x, 4) for x in centre(pose).tolist()] for pose in poses]
 
 
 def run(folder: Path, intrinsics: Tensor) -> dict[str, Any]:
@@ -190,13 +187,10 @@ def run(folder: Path, intrinsics: Tensor) -> dict[str, Any]:
     solver = create_solver("pnpnet-set")
     refiner = PnPNet(None, RobustWeightedLM(m=4))  # the last pose is near: few iterations suffice
 
-    def by_motion(last: Pose, since: int, _: Frame) -> PosePrior:
-        return motion_prior(last, since)
-
     def by_both(last: Pose, since: int, frame: Frame) -> PosePrior:
-        return with_gravity(motion_prior(last, since), frame.down)
+        return with_gravity(motion_prior(last, since, frame), frame.down)
 
-    ways = ((solver, lambda *_: None), (solver, by_motion), (solver, by_both), (refiner, by_both))
+    ways = ((solver, lambda *_: None), (solver, motion_prior), (solver, by_both), (refiner, by_both))
     for way in ways:
         track(frames[:2], intrinsics, *way, PAIRS[-1])  # the first call of a process takes longer
     runs: dict[str, dict[str, Any]] = {str(pairs): {} for pairs in PAIRS}
@@ -204,7 +198,7 @@ def run(folder: Path, intrinsics: Tensor) -> dict[str, Any]:
         runs[str(pairs)][name] = found = track(frames, intrinsics, *way, pairs)
         if pairs != DRAWN:
             del found["path"]
-    true = [place(frame.pose) for frame in frames]
+    true = places(frame.pose for frame in frames)
     return {"frames": len(frames), "right": RIGHT, "stages_ms": stages, "path": true, "runs": runs}
 
 
@@ -213,8 +207,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
     """The paths with few pairs, seen from above, and the share of right frames against the number of pairs."""
     figure = make_figure(7.2, 2.8)
     above, curves = figure.subplots(1, 2)
-    colours = dict(zip(VARIANTS, (ORANGE, GREEN, BLUE, VERMILION), strict=True))
-    few = str(DRAWN)
+    colours, few = dict(zip(VARIANTS, (ORANGE, GREEN, BLUE, VERMILION), strict=True)), str(DRAWN)
     for name in VARIANTS[:1] + VARIANTS[2:3]:
         above.plot(*np.array(results["runs"][few][name]["path"]).T[:2], color=colours[name], linewidth=1.0)
     above.plot(*np.array(results["path"]).T[:2], color="black", linewidth=0.8, linestyle=":")

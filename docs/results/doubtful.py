@@ -1,10 +1,8 @@
 """Problems that a solver must not believe, and small or flat objects that it must believe where it is right.
 
-:func:`doubtful` draws one batch of every kind. ``measure_probability.py`` measures ``ok`` on them, and
+:func:`doubtful` draws one batch of every kind. ``measure_judge.py`` measures ``ok`` on them, and
 ``tests/test_judge.py`` tests it.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -72,14 +70,12 @@ def doubtful(count: int, seed: int) -> Iterator[Kind]:
         points, truth = torch.cat((line, 0.8 * normal(wrong, 3)), 1), pose(5.0)
         pixels = seen(points, truth, 0.5)
         pixels[:, 30:] = anywhere(wrong)
-        yield Kind(
-            f"30 pairs on a line, {wrong} outliers", points, pixels, truth, {"img_sigma": 0.5, "world_sigma": 0.0}
-        )
+        given = {"img_sigma": 0.5, "world_sigma": 0.0}
+        yield Kind(f"30 pairs on a line, {wrong} outliers", points, pixels, truth, given)
     corners = 0.5 * EDGE * torch.tensor([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
     for size, sigma in ((20, 0.3), (60, 1.0), (60, 0.3), (100, 0.3), (400, 0.5)):
-        truth = Pose.from_rvec(
-            0.6 * normal(3) * torch.tensor([1.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 80.0 / size]).expand(count, 3)
-        )
+        turn = 0.6 * normal(3) * torch.tensor([1.0, 1.0, 0.0])
+        truth = Pose.from_rvec(turn, torch.tensor([0.0, 0.0, 80.0 / size]).expand(count, 3))
         points = corners.expand(count, 4, 3).clone()
         given = {"img_sigma": sigma, "world_sigma": 0.0}
         yield Kind(f"tag of {size} px, {sigma} px", points, seen(points, truth, sigma), truth, given)

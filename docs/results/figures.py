@@ -5,8 +5,6 @@ figure for which the files hold data is drawn. Each function writes the picture 
 and returns the path.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -14,7 +12,8 @@ import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
-from itertools import cycle, pairwise
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -240,16 +239,14 @@ def pooled(table: pd.DataFrame) -> pd.DataFrame:
 
 def in_words(table: pd.DataFrame) -> str:
     """The limits of a success, and the numbers of problems."""
+
+    def span(values: Iterable[float], form: str) -> str:
+        return " to ".join(dict.fromkeys(f"{x:{form}}" for x in (min(values), max(values))))
+
     limits = pd.DataFrame(list(table.limit), columns=["degrees", "length", "unit"]).replace("", "world units")
-    lengths = [f"{_span(part.length, '.2g')} {unit}" for unit, part in limits.groupby("unit", sort=False)]
-    problems = f"{_span(table.total, 'd')} problems in each set, 95 % intervals."
-    return f"Solved: errors below {_span(limits.degrees, 'g')}° and {' or '.join(lengths)}. {problems}"
-
-
-def _span(values: Iterable[float], form: str) -> str:
-    """The value, or the least and the largest value when their texts differ."""
-    low, high = f"{min(values):{form}}", f"{max(values):{form}}"
-    return low if low == high else f"{low} to {high}"
+    lengths = [f"{span(part.length, '.2g')} {unit}" for unit, part in limits.groupby("unit", sort=False)]
+    problems = f"{span(table.total, 'd')} problems in each set, 95 % intervals."
+    return f"Solved: errors below {span(limits.degrees, 'g')}° and {' or '.join(lengths)}. {problems}"
 
 
 def outliers_in_words(outliers: int | str, n: int | str = "n") -> str:
@@ -269,15 +266,6 @@ def _by_outliers(table: pd.DataFrame, n: int | str) -> list[Panel]:
     """A panel of rates for each outlier setting: none, uniform, other numbers, other texts."""
     settings = sorted(table.outliers.unique(), key=lambda x: (x != 0, x != "uniform", isinstance(x, str), x))
     return [(outliers_in_words(setting, n), table[table.outliers == setting], "rate") for setting in settings]
-
-
-def plot_operations(path: str | Path, complexity: Mapping[str, Any]) -> Path:
-    """Draw operation counts without and with RANSAC, see ``operations.complexity_results``: figure 1."""
-    counts = {"n": complexity["n"], **complexity["counts"]}
-    table = pd.DataFrame(counts).melt("n", var_name="solver", value_name="operations")
-    sampled = table.solver.isin(complexity["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
-    panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
-    return draw_curves(path, ["Operations that a problem of n pairs takes"], panels, "n")
 
 
 class Content(NamedTuple):
@@ -334,8 +322,7 @@ def mismatches(records: pd.DataFrame) -> Content:
 def against_n(records: pd.DataFrame) -> Content:
     """Success on the protocol's data against the number of pairs, a panel for each outlier setting.
 
-    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve.
-    Other solvers have a curve when they were measured at two n or more.
+    Solvers for one n each, such as ``pnpnet-n9`` and ``pnpnet-n20``, make one curve. Others need two n for a curve.
     """
     table = records.query("source == 'paper' and not swept and not mismatches")
     table = table[table.groupby("outliers").n.transform("nunique") > 1]
@@ -373,7 +360,14 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
     if len(complexity) > 1:
         raise ValueError(f"Expected at most one file of operation counts, got {len(complexity)}.")
     records = read_records(entry for entry in results if entry.get("kind") != "complexity")
-    made = [plot_operations(Path(folder) / "figure1_operations.png", entry) for entry in complexity]
+    made = []
+    for entry in complexity:  # see `operations.complexity_results`
+        counts = pd.DataFrame({"n": entry["n"], **entry["counts"]})
+        table = counts.melt("n", var_name="solver", value_name="operations")
+        sampled = table.solver.isin(entry["ransac"]).map({False: "without RANSAC", True: "with RANSAC"})
+        panels = [(title, part, "operations") for title, part in table.groupby(sampled, sort=False)]
+        heading = ["Operations that a problem of n pairs takes"]
+        made.append(draw_curves(Path(folder) / "figure1_operations.png", heading, panels, "n"))
     for name, content in {
         "figure2_paper": synthetic(records, "paper"),
         "figure3_gaussian_pose": synthetic(records, "gaussian_pose"),
@@ -383,10 +377,9 @@ def paper_figures(results: Sequence[Mapping[str, Any]], folder: str | Path) -> l
         "success_against_m": against_m(records),
     }.items():
         if content.panels:
+            draw: Any = partial(draw_curves, x=content.x) if content.x else draw_dots
             path, heading = Path(folder) / f"{name}.png", [content.title, in_words(content.table)]
-            made.append(
-                draw_curves(path, heading, *content[2:]) if content.x else draw_dots(path, heading, content.panels)
-            )
+            made.append(draw(path, heading, content.panels))
     if not made:
         raise ValueError("The results hold no data for any figure: no data set has a source and outliers to compare.")
     return made
@@ -506,17 +499,14 @@ def plot_real_matches(
         for part, look in _RAW_LOOKS.items():
             style |= look if part in name else {}
     styles = {titles[solver]: looks[shown[solver]] for solver in solvers}
-    shares, pairs = (list(pairwise(costs["settings"][key])) for key in ("shares", "pairs"))
-    by_share = {f"{100 * a:.0f}–{100 * b:.0f} %": f"{100 * a:.0f}–{100 * b:.0f}" for a, b in shares}
-    by_pairs = {f"{a}–{b - 1} pairs": f"{a}–{b - 1}" for a, b in pairs}
     figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
-    plots = ("success", by_share, "outliers (%)"), ("ms", by_share, "outliers (%)"), ("ms", by_pairs, "pairs")
-    for axes, (value, groups, label) in zip(figure.subplots(1, 3), plots, strict=True):
-        there = [group for group in groups if (solvers[0], group) in times]
+    plots = ("success", " %", "outliers (%)"), ("ms", " %", "outliers (%)"), ("ms", " pairs", "pairs")
+    for axes, (value, unit, label) in zip(figure.subplots(1, 3), plots, strict=True):
+        there = [group for solver, group in times if solver == solvers[0] and group.endswith(unit)]
         for name in solvers:
             heights = [100 * table[name][g]["success"] if value == "success" else times[name, g] for g in there]
             axes.plot(np.arange(len(there)), heights, **styles[titles[name]])
-        axes.set_xticks(range(len(there)), [groups[group] for group in there], rotation=40, ha="right")
+        axes.set_xticks(range(len(there)), [group.removesuffix(unit) for group in there], rotation=40, ha="right")
         axes.set(xlabel=label, title="solved (%)" if value == "success" else "ms per problem")
         if value == "ms":
             log_scale(axes, "y")
@@ -530,15 +520,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("files", metavar="FILE", nargs="+", type=Path, help="results (JSON) or a sweep's summary.csv")
     parser.add_argument("--out", metavar="FOLDER", default="outputs/figures", help="default: outputs/figures")
     arguments = parser.parse_args(argv)
+    for path in (path for path in arguments.files if path.suffix == ".csv"):
+        numbers = read_sweep(path)[2]
+        if not numbers:
+            parser.error(f"{path}: no override differs between runs and is a number in all of them.")
+        for name in numbers:
+            print(plot_sweep(Path(arguments.out) / f"sweep_against_{short_name(name)}.png", path, against=name))
     results = []
-    for path in arguments.files:
-        if path.suffix == ".csv":
-            numbers = read_sweep(path)[2]
-            if not numbers:
-                parser.error(f"{path}: no override differs between runs and is a number in all of them.")
-            for name in numbers:
-                print(plot_sweep(Path(arguments.out) / f"sweep_against_{short_name(name)}.png", path, against=name))
-            continue
+    for path in (path for path in arguments.files if path.suffix != ".csv"):
         content = json.loads(path.read_text(encoding="utf-8"))
         counts = isinstance(content, dict) and content.get("kind") == "complexity"
         results.append(content if counts else load_results(path))

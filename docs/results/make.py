@@ -20,8 +20,6 @@ than an hour on one core, and continues where it was stopped::
     python train.py -m experiment=capacity validation_size=5000 hydra.sweep.dir=outputs/capacity resume=true
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

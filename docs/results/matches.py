@@ -1,7 +1,5 @@
 """The page on real matches and the overview of the home page, from what ``benchmarks/real_matches.py`` wrote."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,7 +10,7 @@ import pandas as pd
 import torch
 from figures import find_rows
 from measure import ANY, HERE
-from short_runs import read_summary
+from rates import read_summary
 
 from kornia_pnpnet.metrics import SuccessRate, success_rate
 
@@ -77,7 +75,8 @@ def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Facts of the overview on the home page and in the README: the solvers on the real matches of all files."""
     pooled = pool(files)
     measured = json.loads((HERE / f"{SINGLE}.json").read_text(encoding="utf-8"))
-    single, batched = (pool([of_batch(measured, size)]) for size in (1, BATCH))
+    by_size = [[row for row in measured["rows"] if row["batch"] == size] for size in (1, BATCH)]
+    single, batched = (pool([{**measured, "rows": rows}]) for rows in by_size)
     kinds = [kind for kind in pooled[f"`{ANY}`"] if kind != "all"]
     ours = [f"`{ANY}`", f"`{ANY}`, {SCORES}"]
     others = [name for name in pooled if name[0] != "`" and name != _TITLES["known-inliers"]]
@@ -120,11 +119,6 @@ def microseconds(one: Pooled) -> str:
     return f"{1e3 * one.ms:.0f}"
 
 
-def of_batch(results: Mapping[str, Any], size: int) -> dict[str, Any]:
-    """The file with the rows of one number of problems in a call."""
-    return {**results, "rows": [row for row in results["rows"] if row["batch"] == size]}
-
-
 def points_ahead(pooled: Mapping[str, Mapping[str, Pooled]], ours: str = f"`{ANY}`") -> float:
     """Difference of the success of one of our solvers and of the best PoseLib."""
     return pooled[ours]["all"].success.rate - pooled[best_peer(pooled)]["all"].success.rate
@@ -164,12 +158,5 @@ def facts(name: str, results: Mapping[str, Any], kinds: Iterable[str]) -> dict[s
     shares = ["all", *(f"{100 * a:.0f}–{100 * b:.0f} %" for a, b in pairwise(results["settings"]["shares"]))]
     total = sum(entry[kind]["counted"] for entry in results["counts"] for kind in kinds)
     tables = {kind: find_rows(results, kind) for kind in kinds}
-    return {
-        "name": name,
-        "results": results,
-        "pooled": pooled,
-        "peer": best_peer(pooled),
-        "groups": shares,
-        "tables": tables,
-        "total": total,
-    }
+    found = {"name": name, "results": results, "pooled": pooled, "peer": best_peer(pooled)}
+    return {**found, "groups": shares, "tables": tables, "total": total}

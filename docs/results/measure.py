@@ -1,7 +1,5 @@
 """Measure the results files of the page, put trained weights into the package. ``make.py`` is the command."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise, product
@@ -112,8 +110,7 @@ class FromTheTruth(nn.Module):
 
     def __init__(self, solver: PnPNet) -> None:
         super().__init__()
-        self.config = solver.config()
-        self.solver = solver
+        self.config, self.solver = solver.config(), solver
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """Refine the true poses."""
@@ -132,11 +129,8 @@ def tune(data: Mapping[str, EvaluationData], label: str, names: Iterable[str] = 
         base, grid = TUNED[name]
         choices = product(*([f"{key}={x:g}" for x in values] for key, values in grid.items()))
         specs = [f"{base}{',' if ':' in base else ':'}{','.join(choice)}" for choice in choices]
-        results = evaluate(named(specs), data, path=OUTPUTS / "tuning" / f"{label}, {name}.json", repeats=1)
-        total = dict.fromkeys(specs, 0.0)
-        for row in results["rows"]:
-            total[row["solver"]] += row["success"]["rate"]
-        best[name] = max(total, key=lambda spec: total[spec])
+        rows = evaluate(named(specs), data, path=OUTPUTS / "tuning" / f"{label}, {name}.json", repeats=1)["rows"]
+        best[name] = max(specs, key=lambda x: sum(row["success"]["rate"] for row in rows if row["solver"] == x))
     return best
 
 
@@ -233,12 +227,13 @@ def measure_set(counts: Counts, wanted: set[str]) -> None:
 
 def tune_sigma(data: Mapping[str, EvaluationData]) -> float:
     """The standard deviation of the pixels with the highest success: to this solver what a threshold is to others."""
-    solved = dict.fromkeys(SIGMAS, 0.0)
-    for sigma in SIGMAS:
+
+    def solved(sigma: float) -> float:
         path = OUTPUTS / "tuning" / f"set, {sigma:g}.json"
         rows = evaluate(named((ANY,)), with_known_noise(data, sigma), path=path, repeats=1)["rows"]
-        solved[sigma] = sum(row["success"]["rate"] for row in rows)
-    return max(solved, key=lambda sigma: solved[sigma])
+        return sum(float(row["success"]["rate"]) for row in rows)
+
+    return max(SIGMAS, key=solved)
 
 
 def with_known_noise(sets: Mapping[str, EvaluationData], img_sigma: float) -> dict[str, EvaluationData]:
@@ -277,8 +272,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     diagrams = {}
     for name, entry in sets.items():
         problems = entry.problems
-        guess = solver.with_starts(*problems[:3])[1]
-        found = reliability(guess.weights, problems.inliers)
+        found = reliability(solver.with_starts(*problems[:3])[1].weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}
 
@@ -335,14 +329,12 @@ def measure(scenes: Path, synthetic_count: int, real_count: int, only: Sequence[
     for names, step in STEPS:
         if wanted & names:
             step(Counts(scenes, synthetic_count, real_count), wanted & names)
+    if wanted & {"probability", "judge"}:
+        import measure_judge  # needs hydra
     if "probability" in wanted:
-        from measure_probability import measure_probability  # needs hydra
-
-        write_json(HERE / "probability.json", measure_probability(SEED_TUNE, SEED_REPORT + 60))
+        write_json(HERE / "probability.json", measure_judge.measure_probability(SEED_TUNE, SEED_REPORT + 60))
     if "judge" in wanted:
-        from measure_judge import measure_judge
-
-        write_json(HERE / "judge.json", measure_judge(scenes, SEED_REPORT + 70))
+        write_json(HERE / "judge.json", measure_judge.measure_judge(scenes, SEED_REPORT + 70))
     if "complexity" in wanted:
         write_json(HERE / "complexity.json", complexity_results())
 

@@ -9,8 +9,6 @@ Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network
 Lightspeed toolbox.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -113,12 +111,9 @@ _REDUCTIONS = {
 }
 # Cost for one matrix of the batch, by the shapes of the input matrices.
 _MATRIX: dict[str, Callable[..., float]] = {
-    **dict.fromkeys(("mm", "bmm"), lambda first, second: matmul(first[0], first[1], second[1])),
-    **dict.fromkeys(
-        ("addmm", "baddbmm"),
-        lambda bias, first, second: matmul(first[0], first[1], second[1]) + first[0] * second[1] * ADD,
-    ),
-    "mv": lambda first, second: matmul(first[0], first[1], 1),
+    **dict.fromkeys(("mm", "bmm"), lambda a, b: matmul(a[0], a[1], b[1])),
+    **dict.fromkeys(("addmm", "baddbmm"), lambda _, a, b: matmul(a[0], a[1], b[1]) + a[0] * b[1] * ADD),
+    "mv": lambda a, _: matmul(a[0], a[1], 1),
     "linalg_cholesky_ex": lambda matrix: cholesky(matrix[0]),
     "linalg_inv_ex": lambda matrix: solve(matrix[0], matrix[0]),
     "_linalg_solve_ex": lambda matrix, right: solve(matrix[0], right[1]),
@@ -203,9 +198,7 @@ class OperationCounter(TorchDispatchMode):
         super().__init__()  # type: ignore[no-untyped-call]
         self.total = 0.0
 
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run one operation and add its cost."""
         output = func(*args, **(kwargs or {}))
         names = [argument.name for argument in func._schema.arguments]
@@ -266,19 +259,11 @@ def complexity_results(solvers: Sequence[str] = SOLVERS, n: Iterable[int] = rang
     sizes = list(n)
     inits = {name: _solver(name, n=9).init for name in solvers}
     samples = {name: init.minimal.sample_size for name, init in inits.items() if isinstance(init, RANSAC)}
-    counts = {
-        name: [
-            operation_count(name, size, outliers=size // 3) if size >= samples.get(name, 0) else None for size in sizes
-        ]
-        for name in solvers
-    }
-    return {
-        "kind": "complexity",
-        "format": 1,
-        "n": sizes,
-        "counts": counts,
-        "ransac": list(samples),
-        "outliers": [size // 3 for size in sizes],
-        "costs": OPERATION_COSTS,
-        "environment": environment(),
-    }
+
+    def count(name: str, n: int) -> float | None:
+        return operation_count(name, n, outliers=n // 3) if n >= samples.get(name, 0) else None
+
+    counts = {name: [count(name, size) for size in sizes] for name in solvers}
+    made = {"kind": "complexity", "format": 1, "n": sizes, "counts": counts, "ransac": list(samples)}
+    outliers = [size // 3 for size in sizes]
+    return {**made, "outliers": outliers, "costs": OPERATION_COSTS, "environment": environment()}

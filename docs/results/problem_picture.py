@@ -1,7 +1,5 @@
 """The picture of the home page: a synthetic house, the pairs that ``pnpnet-set`` rejects, and the pose it finds."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -37,13 +35,11 @@ def _in_camera(points: Tensor) -> Tensor:
     return points @ (down @ around).mT + _PLACE
 
 
-class _HousePoints:
+def _house_points(batch_size: int, n: int, generator: torch.Generator) -> Tensor:
     """Points on the edges of the house, see :class:`kornia_pnpnet.data.PointPrior`."""
-
-    def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-        edges = _CORNERS[_EDGES[torch.randint(len(_EDGES), (batch_size, n), generator=generator)]]  # (B, n, 2, 3)
-        along = torch.rand((batch_size, n, 1), generator=generator, dtype=torch.float64)
-        return _in_camera(torch.lerp(edges[..., 0, :], edges[..., 1, :], along))
+    edges = _CORNERS[_EDGES[torch.randint(len(_EDGES), (batch_size, n), generator=generator)]]  # (B, n, 2, 3)
+    along = torch.rand((batch_size, n, 1), generator=generator, dtype=torch.float64)
+    return _in_camera(torch.lerp(edges[..., 0, :], edges[..., 1, :], along))
 
 
 def _frustum(pose: Pose) -> Tensor:
@@ -59,7 +55,7 @@ def _frustum(pose: Pose) -> Tensor:
 def plot_problem(path: str | Path) -> Path:
     """Draw the pairs in the image, kept and rejected, and the points in space with the camera that was found."""
     outliers = OutlierMix(count=_OUTLIERS, mismatch_share=1.0)
-    source = SyntheticProblems(n=_PAIRS, batch_size=1, seed=_SEED, points=_HousePoints(), outliers=outliers)
+    source = SyntheticProblems(n=_PAIRS, batch_size=1, seed=_SEED, points=_house_points, outliers=outliers)
     problem = source.batch(0)
     with torch.no_grad():
         result = create_solver("pnpnet-set")(problem.world_points, problem.img_points, problem.intrinsics)

@@ -1,7 +1,5 @@
 """Write the results pages, the overviews and their pictures from the results files. ``make.py`` is the command."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,8 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matches import MATCHES, overview, page_facts, title
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from problem_picture import plot_problem
-from rates import Rates, compare_all, interval, shown
-from short_runs import KERNEL, ablation, capacity, percent, read_summary, sweep
+from rates import KERNEL, Rates, ablation, capacity, compare_all, interval, percent, read_summary, shown, sweep
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.evaluation.plots import plot_training
@@ -68,8 +65,8 @@ def rigs(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     }
 
 
-def page() -> str:
-    """The results page as Markdown."""
+def page(overview: str) -> str:
+    """The results page as Markdown, with an overview of real matches."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
     complexity, runs = load("complexity"), {name: read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
     benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
@@ -86,7 +83,7 @@ def page() -> str:
         commits={name: f"{entry['environment']['commit']:.9}" for name, entry in results.items()},
         results=results,
         operations={name: counts[at_nine] for name, counts in complexity["counts"].items()},
-        overview=written("overview.md.jinja", link="real_matches.md", **overview(load_matches())),
+        overview=overview,
         summary=summary(benchmark["rows"]),
         summary_sets=SUMMARY_SETS,
         benchmark=benchmark,
@@ -111,12 +108,6 @@ def page() -> str:
     )
 
 
-def real_matches() -> str:
-    """The page on real matches as Markdown."""
-    facts = page_facts(load_matches(), load("real_matches_cost"), load("keypoints"))
-    return written("real_matches.md.jinja", **facts)
-
-
 def with_block(text: str, block: str) -> str:
     """The text with another block between the lines ``BEGIN`` and ``END``; ``ValueError`` without one of each line."""
     if text.count(BEGIN) != 1 or text.count(END) != 1:
@@ -124,27 +115,24 @@ def with_block(text: str, block: str) -> str:
     return f"{text.partition(BEGIN)[0]}{BEGIN}\n{block}\n{END}{text.partition(END)[2]}"
 
 
-def with_overview(path: Path) -> str:
-    """The page at ``path`` with the overview, whose link leads from there."""
-    link = Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix()
-    block = written("overview.md.jinja", link=link, **overview(load_matches()))
-    return with_block(path.read_text(encoding="utf-8"), block)
-
-
 def load(name: str, folder: Path = HERE) -> Any:
     """The content of a JSON file."""
     return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
 
 
-def load_matches() -> list[Any]:
-    """The files :data:`matches.MATCHES`."""
-    return [load(name) for name in MATCHES]
-
-
 def pages() -> dict[Path, str]:
     """The pages and the texts that their files hold."""
-    overviews = {path: with_overview(path) for path in OVERVIEW_PAGES}
-    return {HERE / "README.md": page(), HERE / "real_matches.md": real_matches(), **overviews}
+    matches = [load(name) for name in MATCHES]
+    facts = overview(matches)
+    found = {HERE / "README.md": page(written("overview.md.jinja", link="real_matches.md", **facts))}
+    found[HERE / "real_matches.md"] = written(
+        "real_matches.md.jinja", **page_facts(matches, load("real_matches_cost"), load("keypoints"))
+    )
+    for path in OVERVIEW_PAGES:
+        link = Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix()
+        block = written("overview.md.jinja", link=link, **facts)
+        found[path] = with_block(path.read_text(encoding="utf-8"), block)
+    return found
 
 
 def render() -> None:
@@ -156,7 +144,7 @@ def render() -> None:
     plot_sweep(HERE / "sweep_against_n.png", HERE / "sweep.csv", against="model.n")
     plot_sweep(HERE / "sweep_against_m.png", HERE / "sweep.csv", against="model.m")
     plot_reliability(HERE / "reliability.png", load("honesty")["reliability"])
-    costs, matches = load("real_matches_cost"), load_matches()[0]
+    costs, matches = load("real_matches_cost"), load(MATCHES[0])
     titles = {solver: title(solver, costs["settings"]).replace("`", "") for solver in costs["settings"]["solvers"]}
     plot_real_matches(HERE / "real_matches.png", matches, costs, titles)
     plot_problem(HERE / "problem.png")
