@@ -6,6 +6,8 @@ import copy
 import importlib
 import io
 import warnings
+import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,6 +79,8 @@ _MAX_BATCH = 2**20
 _MAX_N = 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
+# Name of a package's only model, and the folder of the models in the archive of a package.
+_MODEL, _MODELS = "model", "/data/aotinductor/"
 
 
 class _Graph(nn.Module):
@@ -182,7 +186,12 @@ def check_packages(suffix: str) -> None:
 
 
 def export_package(
-    solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
+    solver: PnPNet,
+    path: str | Path,
+    n: int | Sequence[int] | None = None,
+    *,
+    batch: int | None = None,
+    rig: bool = False,
 ) -> Path:
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
@@ -195,6 +204,10 @@ def export_package(
     packages. With PyTorch's own loader, a call of such a package overwrites the result of the previous call on the same
     thread.
 
+    ``n`` may also be several numbers of pairs, such as ``(16, 64, 256)``. The file then holds a model for each number,
+    and a problem is padded to the next number. C++ programs choose a model by its name: "n16" is the model for 16
+    pairs. The name of a single model is "model".
+
     Returns:
         The path, which must end in ``.pt2``.
 
@@ -205,6 +218,20 @@ def export_package(
     if path.suffix != ".pt2":
         raise ValueCheckError(f"The name of a package must end in .pt2, got '{path}'.")
     check_packages(".pt2")
+    from torch._inductor.package.package import package_aoti  # imports the compiler
+
+    sizes = {f"n{size}": size for size in n} if isinstance(n, Sequence) else {_MODEL: n}
+    check_whole(1, sizes=len(sizes))
+    files = {name: _compiled(solver, size, batch=batch, rig=rig) for name, size in sizes.items()}
+    content = io.BytesIO()
+    package_aoti(content, files)
+    with atomic_open(path, "wb") as file:
+        file.write(content.getbuffer())
+    return path
+
+
+def _compiled(solver: PnPNet, n: int | None, *, batch: int | None, rig: bool) -> Any:
+    """Compile a solver, and return the files of a model of a package."""
     program = export_program(solver, n, batch=batch, rig=rig)
     pairs = _fixed_n(solver, n)
     metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}
@@ -212,14 +239,11 @@ def export_package(
     # problems, inlined operators are slower than calls.
     inline = batch == 1 and pairs is not None
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
-    content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the compiler warns about its own code
         program = program.run_decompositions(INLINE) if inline else program
-        torch._inductor.aoti_compile_and_package(program, package_path=content, inductor_configs=options)
-    with atomic_open(path, "wb") as file:
-        file.write(content.getbuffer())
-    return path
+        inputs, options = program.example_inputs, {**options, "aot_inductor.package": True}
+        return torch._inductor.aot_compile(program.module(check_guards=False), *inputs, options=options)
 
 
 class PackagedSolver:
@@ -229,15 +253,18 @@ class PackagedSolver:
 
     Attributes:
         batch: number of problems in each call; ``None``: any number.
-        n: number of pairs per problem; ``None``: any number of at least 4.
+        sizes: the numbers of pairs of the package's models, in increasing order; empty: any number of at least 4. With
+            several models, the smallest model that is large enough solves a problem, and the problem is padded.
         rig: whether the package solves problems of rigs.
     """
 
-    def __init__(self, loader: torch._C._aoti.AOTIModelPackageLoader) -> None:
-        self._run = loader.run
-        metadata = loader.get_metadata()
-        self.batch, self.n = (None if metadata[key] == _ANY else int(metadata[key]) for key in (_BATCH, _N))
-        self.rig = metadata.get(_RIG) == str(True)
+    def __init__(self, loaders: Sequence[torch._C._aoti.AOTIModelPackageLoader]) -> None:
+        metadata = [loader.get_metadata() for loader in loaders]
+        self.batch = None if metadata[0][_BATCH] == _ANY else int(metadata[0][_BATCH])
+        self.rig = metadata[0][_RIG] == str(True)
+        fixed = metadata[0][_N] != _ANY
+        self._runs = {int(of[_N]) if fixed else 0: loader.run for of, loader in zip(metadata, loaders, strict=True)}
+        self.sizes = tuple(sorted(self._runs)) if fixed else ()
 
     def __call__(
         self,
@@ -256,17 +283,24 @@ class PackagedSolver:
         """
         if self.rig != (cam_from_rig is not None):
             raise ValueCheckError(f"This package {'needs' if self.rig else 'does not take'} cam_from_rig.")
-        batch, n = (*world_points.shape, 0, 0)[:2]
-        batch, n = self.batch or batch, self.n or max(n, 4)
+        batch, given = (*world_points.shape, 0, 0)[:2]
+        size = next((size for size in self.sizes if size >= given), max(self.sizes, default=0))
+        any_number = not self.sizes or (len(self.sizes) > 1 and given <= size)
+        batch, n = self.batch or batch, max(given, 4) if any_number else size
         weights = world_points.new_ones(batch, n) if weights is None else weights
         cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
         intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
         inputs = world_points, img_points, intrinsics, weights, *(cam_from_rig or ())
         check_shapes(dict(zip(RIG_INPUTS, zip(inputs, shapes, strict=False), strict=False)))
+        if n < size:  # padding: the last pair again, with a weight of 0
+            pair = torch.arange(size, device=weights.device).clamp(max=n - 1)
+            inputs = tuple(x if x is intrinsics and not self.rig else x.index_select(1, pair) for x in inputs)
+            inputs[3][:, n:] = 0.0
         # Compiled code does not check dtypes and strides. Results are copied, because the next call may overwrite them.
-        results = self._run([x.to("cpu", torch.float32).contiguous() for x in inputs])
-        return (ExportedResult if len(results) == len(OUTPUTS) else ExportedCamera)(*[x.clone() for x in results])
+        results = self._runs[size]([x.to("cpu", torch.float32).contiguous() for x in inputs])
+        kind = ExportedResult if len(results) == len(OUTPUTS) else ExportedCamera
+        return kind(*[x.clone() for x in results])._replace(pair_weights=results[2][:, :n].clone())
 
 
 def load_package(path: str | Path) -> PackagedSolver:
@@ -280,9 +314,12 @@ def load_package(path: str | Path) -> PackagedSolver:
     """
     Path(path).open("rb").close()
     try:
+        with zipfile.ZipFile(path) as archive:
+            names = {entry.split(_MODELS)[1].split("/")[0] for entry in archive.namelist() if _MODELS in entry}
         # `torch._inductor.aoti_load_package` is not used, because it spends seconds on the import of the compiler.
-        return PackagedSolver(torch._C._aoti.AOTIModelPackageLoader(str(path), "model", False, 1, -1))
-    except (RuntimeError, KeyError, ValueError) as error:
+        load = torch._C._aoti.AOTIModelPackageLoader
+        return PackagedSolver([load(str(path), name, False, 1, -1) for name in sorted(names)])
+    except (RuntimeError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
         message = f"'{path}' is not a solver of export_package for this machine: {_reason(error)}"
         raise ValueCheckError(message) from error
 

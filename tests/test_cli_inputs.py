@@ -93,7 +93,7 @@ def test_spoiled_results_are_a_line_and_no_traceback(tmp_path, drawn):
 COMMANDS = {
     "solve": (("sound.csv", "--intrinsics", "3400,3400,0,0"), "--solver --threshold --batch-size --focal --camera"),
     "evaluate": (("--solver", "epnp", "--problems", 3), "--solver --data --n --outliers --seed --dtype --plot"),
-    "export": (("--solver", "p3p-ransac"), "--n"),
+    "export": (("--solver", "p3p-ransac"), "--pairs"),
     "list": ((), "--x"),
     "demo": (("--problems", 3, "--train-seconds", 0), "--data --problems"),
 }

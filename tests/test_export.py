@@ -181,7 +181,7 @@ def test_packages(n, batch, sizes, make_problems, tmp_path):
     """Tensors of other dtypes and layouts than the package was compiled for, and a broken problem."""
     solver = PnPNet(None, RobustWeightedLM(1))
     package = load_package(packaged(tmp_path, solver, n, batch=batch))
-    assert (package.n, package.batch) == (n, batch)
+    assert (package.sizes, package.batch) == (() if n is None else (n,), batch)
     for count, size in sizes:
         inputs = inputs_of(broken(make_problems(n=count, batch=size, outliers=count // 4)))
         found = package(*inputs)
@@ -198,6 +198,25 @@ def test_packages(n, batch, sizes, make_problems, tmp_path):
     for inputs in wrong:
         with pytest.raises(ShapeError):
             package(*inputs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", [False, True])
+def test_a_package_for_several_numbers_of_pairs_pads(rig, make_problems, tmp_path):
+    solver = create_solver("epnp") if rig else PnPNet(None, RobustWeightedLM(1))
+    package = load_package(packaged(tmp_path, solver, (12, 8), batch=2, rig=rig))
+    assert package.sizes == (8, 12)
+    for n in (5, 8, 9, 12):
+        inputs = rigs(n, 2) if rig else inputs_of(make_problems(n=n, batch=2))
+        before = [x.clone() for x in inputs]
+        found = package(*inputs[:4], cam_from_rig=Pose(*inputs[4:]) if rig else None)
+        assert found.pair_weights.shape == (2, n)
+        near(found, solver, inputs)
+        assert all(torch.equal(x, y) for x, y in zip(inputs, before, strict=True))
+    for n in (3, 13):
+        world, img, intrinsics, _ = inputs_of(make_problems(n=n, batch=2))
+        with pytest.raises((ShapeError, ValueCheckError)):
+            package(world, img, intrinsics)
 
 
 @pytest.mark.slow

@@ -144,7 +144,11 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
     "export": {
         "file": _arg("the file to write, .onnx or .pt2", "FILE"),
         "--solver": _SOLVER,
-        "--n": _arg("correspondences per problem; default: any number", "N", type=_whole(1)),
+        "--pairs": _arg(
+            "correspondences per problem; several: models for padded problems (.pt2); default: any number",
+            "LIST",
+            type=_counts,
+        ),
         "--batch": _arg("problems per call; default: any number", "B", type=_whole(1)),
         "--rig": _flag("for rigs: several cameras with one pose"),
         "--overwrite": _flag("replace the file"),

@@ -5,6 +5,7 @@ compiling, in Python and in C++ with libtorch; it runs on CPUs like the one that
 
   pnpnet export pnpnet-set.onnx
   pnpnet export pnpnet-n9.pt2 --solver pnpnet-n9 --batch 1
+  pnpnet export pnpnet-set.pt2 --batch 1 --pairs 16,64,256
   pnpnet export rig.onnx --rig
 """
 
@@ -25,6 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
     from kornia_pnpnet import export
     from kornia_pnpnet.solver import PnPNet
 
+    if target.suffix == ".onnx" and len(arguments.pairs or ()) > 1:
+        raise ValueError("--pairs: an ONNX model has one number of pairs, or any number")
     export.check_packages(target.suffix)
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
@@ -34,12 +37,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"'{target}' is a folder")
     if target.exists() and not arguments.overwrite:
         raise ValueError(f"'{target}' exists: pass --overwrite to replace it")
+    pairs = arguments.pairs if arguments.pairs is None or len(arguments.pairs) > 1 else arguments.pairs[0]
     is_onnx = target.suffix == ".onnx"
     print(f"Tracing and {'converting' if is_onnx else 'compiling'}; PyTorch takes a minute or more", flush=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # PyTorch's exporter warns about its own code
         write = export.export_onnx if is_onnx else export.export_package
-        path = write(solver, target, arguments.n, batch=arguments.batch, rig=arguments.rig)
+        path = write(solver, target, pairs, batch=arguments.batch, rig=arguments.rig)
     outputs = export.OUTPUTS if solver.focal == "known" else export.ExportedCamera._fields
     inputs = export.RIG_INPUTS if arguments.rig else export.INPUTS
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {', '.join(inputs)} -> {', '.join(outputs)}")
