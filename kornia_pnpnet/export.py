@@ -73,8 +73,7 @@ RIG_INPUTS = (*INPUTS, "rig_rotation", "rig_translation")
 #: Names of the outputs of a solver with a known focal length.
 OUTPUTS = ExportedResult._fields
 # Upper bounds of the dynamic dimensions. With finite ranges torch.export can simplify its guards.
-_MAX_BATCH = 2**20
-_MAX_N = 2**16
+_MAX_BATCH, _MAX_N = 2**20, 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
 
@@ -146,8 +145,7 @@ def export_program(
     points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
     shapes = (points, points, points if rig else sizes, points, *((points, points),) * rig)
     try:
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
+        with torch.no_grad(), warnings.catch_warnings(action="ignore", category=FutureWarning):  # of PyTorch's own code
             return torch.export.export(_Graph(copy.deepcopy(solver).float().eval()), inputs, dynamic_shapes=shapes)
     except Exception as error:
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {_reason(error)}") from error
@@ -186,14 +184,13 @@ def export_package(
 ) -> Path:
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
-    :func:`load_package` loads the package without tracing or compiling. C++ programs load the package with libtorch
-    alone. A package runs on one thread. The loading CPU must have the instruction sets (for example AVX-512) of the
-    compiling CPU. The loading program must have the PyTorch version of the compiling program. Compiling takes minutes.
-    An existing file is replaced when the package is complete.
+    :func:`load_package` loads the package without tracing or compiling; C++ programs load it with libtorch alone. A
+    package runs on one thread. It needs the PyTorch version of the compiling program, and a CPU with the instruction
+    sets (for example AVX-512) of the compiling CPU. Compiling takes minutes. An existing file is replaced when the
+    package is complete.
 
     A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
-    packages. With PyTorch's own loader, a call of such a package overwrites the result of the previous call on the same
-    thread.
+    packages. With PyTorch's own loader, each call of such a package in a thread overwrites the previous result.
 
     Returns:
         The path, which must end in ``.pt2``.
@@ -213,8 +210,7 @@ def export_package(
     inline = batch == 1 and pairs is not None
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
     content = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the compiler warns about its own code
+    with warnings.catch_warnings(action="ignore"):  # the compiler warns about its own code
         program = program.run_decompositions(INLINE) if inline else program
         torch._inductor.aoti_compile_and_package(program, package_path=content, inductor_configs=options)
     with atomic_open(path, "wb") as file:
@@ -300,8 +296,7 @@ def export_onnx(
     program = export_program(solver, n, batch=batch, rig=rig)
     inputs, outputs = RIG_INPUTS if rig else INPUTS, OUTPUTS if solver.focal == "known" else ExportedCamera._fields
     names: dict[str, Any] = {"input_names": [*inputs], "output_names": [*outputs]}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):  # the exporter warns about its own code
         model = torch.onnx.export(program, dynamo=True, verbose=False, optimize=False, **names)
     assert model is not None
     _simplify(model.model)

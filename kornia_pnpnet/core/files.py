@@ -82,7 +82,7 @@ def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] =
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the named arrays of an NPZ file that the file has, ``None``: all, without unpickling.
+    """Read those of the named arrays (``None``: all arrays) that an NPZ file has, without unpickling.
 
     Raises:
         ValueError: when the file is not an NPZ file of numbers, or when the arrays take more than :data:`MOST_BYTES`.

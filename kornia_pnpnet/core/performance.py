@@ -282,8 +282,7 @@ class Runner:
             for tensor in tensors:
                 if tensor.ndim and tensor.shape[0] > 1:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the compiler warns about its own code
+            with warnings.catch_warnings(action="ignore"):  # the compiler warns about its own code
                 result: _T = self._functions[name, many](*args)
             self._seen.add(kind)
             return result
@@ -300,7 +299,7 @@ class Runner:
         options = torch._inductor.list_mode_options(self.mode or "default") | {
             "cpp.vec_isa_ok": True,  # skip tests of instruction sets, half of the time of the first compilation
             "cpp.enable_loop_tail_vec": False,  # a third less time of compilation, and the same time of calls
-            "guard_filter_fn": _needs_check,
+            "guard_filter_fn": _needed_guards,
             **({"pick_loop_orders": False} if many else {}),
         }
         # Each number of pairs and each dtype needs two compilations, with and without gradients. The limit applies to
@@ -313,13 +312,13 @@ class Runner:
         return lambda *args: map_tensors(torch.clone, run(*args))
 
 
-#: The runner that calls all functions uncompiled.
-EAGER = Runner()
-
-
-def _needs_check(guards: Sequence[Any]) -> list[bool]:
+def _needed_guards(guards: Sequence[Any]) -> list[bool]:
     """Skip the guards of global functions and constants, which never change. Each guard takes time at each call."""
     return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
+
+
+#: The runner that calls all functions uncompiled.
+EAGER = Runner()
 
 
 def per_problem(scalar: Tensor, like: Tensor) -> Tensor:

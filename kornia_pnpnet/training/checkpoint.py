@@ -80,8 +80,7 @@ class History:
     """Learning curves in a CSV file and TensorBoard. Rows of an earlier call are kept up to the update ``start``."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
-        self._path = folder / HISTORY_NAME
-        self._columns = columns
+        self._path, self._columns = folder / HISTORY_NAME, columns
         rows: list[dict[str, Any]] = []
         if start and self._path.is_file():
             with self._path.open(newline="") as file:  # a crash can cut the last row

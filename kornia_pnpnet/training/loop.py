@@ -313,15 +313,10 @@ def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: fl
 
 
 def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) -> Path:
-    """Train a new PnP-Net for n = 9 for a short time, and return the path of the learning curves (CSV).
+    """Train a new PnP-Net for n = 9 for about ``seconds``, and return the path of the learning curves (CSV).
 
-    Args:
-        seconds: approximate duration. The number of updates follows from a short measurement of the machine's speed.
-        folder: folder of the run. An earlier run in this folder is replaced.
-        progress: show a progress bar.
-
-    Raises:
-        BaseError: when ``seconds`` is not a positive number.
+    The number of updates follows from a short measurement of the machine's speed. An earlier run in ``folder`` is
+    replaced. ``BaseError``: ``seconds`` is not a positive number.
     """
     check_positive(seconds=seconds)
     folder = Path(folder)
