@@ -16,8 +16,6 @@ from torch import Tensor
 from kornia_pnpnet.core.files import InputError, read_csv, read_npz
 from kornia_pnpnet.problem import MIN_PAIRS
 
-__all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays", "read_correspondences"]
-
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 
 

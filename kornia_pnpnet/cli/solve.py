@@ -98,7 +98,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
 
     from kornia_pnpnet import Status, diagnose
     from kornia_pnpnet.cameras import reproject
-    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences
+    from kornia_pnpnet.cli.correspondence_files import read_correspondences
+    from kornia_pnpnet.core.files import InputError
 
     (path,), name, plot = arguments.file, arguments.solver, arguments.plot
     matches = read_correspondences(path)

@@ -17,17 +17,6 @@ from torch.utils.tensorboard import SummaryWriter
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.evaluation.results import differences
 
-__all__ = [
-    "CHECKPOINT_NAME",
-    "HISTORY_NAME",
-    "History",
-    "StageClock",
-    "TrainingError",
-    "load_checkpoint",
-    "stop_on_signal",
-    "write_csv",
-]
-
 CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
 
 
