@@ -28,7 +28,7 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort the pixels of a camera, see ``kornia_pnpnet.data.colmap.undistort``; where impossible, weight 0."""
+        """Undistort the pixels by ``kornia_pnpnet.data.colmap.undistort``; pixels without a ray get the weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:

@@ -90,9 +90,7 @@ class History:
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Raises:
-        TrainingError: when the file is damaged, or when ``identity`` differs from the identity in the file, except by
-            a larger number of updates.
+    ``TrainingError``: the file is damaged, or its identity differs from ``identity``, which may have more updates.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
