@@ -75,8 +75,7 @@ RIG_INPUTS = (*INPUTS, "rig_rotation", "rig_translation")
 #: Names of the outputs of a solver with a known focal length.
 OUTPUTS = ExportedResult._fields
 # Upper bounds of the dynamic dimensions. With finite ranges torch.export can simplify its guards.
-_MAX_BATCH = 2**20
-_MAX_N = 2**16
+_MAX_BATCH, _MAX_N = 2**20, 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
 # Name of a package's only model, and the folder of the models in the archive of a package.
@@ -150,8 +149,7 @@ def export_program(
     points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
     shapes = (points, points, points if rig else sizes, points, *((points, points),) * rig)
     try:
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
+        with torch.no_grad(), warnings.catch_warnings(action="ignore", category=FutureWarning):  # of PyTorch's own code
             return torch.export.export(_Graph(copy.deepcopy(solver).float().eval()), inputs, dynamic_shapes=shapes)
     except Exception as error:
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {_reason(error)}") from error
@@ -195,14 +193,13 @@ def export_package(
 ) -> Path:
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
-    :func:`load_package` loads the package without tracing or compiling. C++ programs load the package with libtorch
-    alone. A package runs on one thread. The loading CPU must have the instruction sets (for example AVX-512) of the
-    compiling CPU. The loading program must have the PyTorch version of the compiling program. Compiling takes minutes.
-    An existing file is replaced when the package is complete.
+    :func:`load_package` loads the package without tracing or compiling; C++ programs load it with libtorch alone. A
+    package runs on one thread. It needs the PyTorch version of the compiling program, and a CPU with the instruction
+    sets (for example AVX-512) of the compiling CPU. Compiling takes minutes. An existing file is replaced when the
+    package is complete.
 
     A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
-    packages. With PyTorch's own loader, a call of such a package overwrites the result of the previous call on the same
-    thread.
+    packages. With PyTorch's own loader, each call of such a package in a thread overwrites the previous result.
 
     ``n`` may also be several numbers of pairs, such as ``(16, 64, 256)``. The file then holds a model for each number,
     and a problem is padded to the next number. C++ programs choose a model by its name: "n16" is the model for 16
@@ -239,8 +236,7 @@ def _compiled(solver: PnPNet, n: int | None, *, batch: int | None, rig: bool) ->
     # problems, inlined operators are slower than calls.
     inline = batch == 1 and pairs is not None
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the compiler warns about its own code
+    with warnings.catch_warnings(action="ignore"):  # the compiler warns about its own code
         program = program.run_decompositions(INLINE) if inline else program
         inputs, options = program.example_inputs, {**options, "aot_inductor.package": True}
         return torch._inductor.aot_compile(program.module(check_guards=False), *inputs, options=options)
@@ -337,8 +333,7 @@ def export_onnx(
     program = export_program(solver, n, batch=batch, rig=rig)
     inputs, outputs = RIG_INPUTS if rig else INPUTS, OUTPUTS if solver.focal == "known" else ExportedCamera._fields
     names: dict[str, Any] = {"input_names": [*inputs], "output_names": [*outputs]}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # the exporter warns about its own code
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):  # the exporter warns about its own code
         model = torch.onnx.export(program, dynamo=True, verbose=False, optimize=False, **names)
     assert model is not None
     _simplify(model.model)

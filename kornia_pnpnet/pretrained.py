@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
@@ -86,7 +87,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
 
 def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
-    return digest(config, *(part for item in sorted(state.items()) for part in item))
+    return digest(config, *chain.from_iterable(sorted(state.items())))
 
 
 def find_weights(name_or_folder: str | Path) -> Path:

@@ -12,8 +12,6 @@ from kornia_pnpnet import __version__
 from kornia_pnpnet.cli import demo, evaluate, export, listing, solve
 from kornia_pnpnet.cli.arguments import ARGUMENTS, OneLineParser
 
-__all__ = ["COMMANDS", "main", "make_parser"]
-
 #: All commands by name, in the order of ``pnpnet --help``.
 COMMANDS = {"solve": solve, "evaluate": evaluate, "export": export, "list": listing, "demo": demo}
 

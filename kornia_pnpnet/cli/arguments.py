@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 if TYPE_CHECKING:
     from torch import nn
 
-__all__ = ["ARGUMENTS", "SYNTHETIC", "OneLineParser", "load_solver_without_truth"]
-
 _T = TypeVar("_T")
 
 # Largest standard deviation of the logarithm of a focal length. With a larger one the focal length is unknown.

@@ -16,8 +16,6 @@ from torch import Tensor
 from kornia_pnpnet.core.files import InputError, read_csv, read_npz
 from kornia_pnpnet.problem import MIN_PAIRS
 
-__all__ = ["ImageCorrespondences", "InputError", "camera_matrix", "read_arrays", "read_correspondences"]
-
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 
 
@@ -26,11 +24,11 @@ class ImageCorrespondences(NamedTuple):
 
     world_points: Tensor  # (N, 3)
     img_points: Tensor  # pixels, (N, 2)
-    weights: Tensor | None = None  # at least 0, (N,)
+    weights: Tensor  # at least 0, (N,); 1 without weights in the file
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort the pixels of a camera, see ``kornia_pnpnet.data.colmap.undistort``; where impossible, weight 0."""
+        """Undistort the pixels by ``kornia_pnpnet.data.colmap.undistort``; pixels without a ray get the weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -38,7 +36,7 @@ class ImageCorrespondences(NamedTuple):
         except ValueError as error:
             raise InputError("--camera", str(error)) from None
         there = pixels.isfinite().all(-1)
-        weights = there.to(pixels) if self.weights is None else torch.where(there, self.weights, 0.0)
+        weights = torch.where(there, self.weights, 0.0)
         pixels = torch.where(there[:, None], pixels, matrix[:2, 2])
         return ImageCorrespondences(self.world_points, pixels, weights, _pinhole(matrix, "--camera"))
 
@@ -76,18 +74,19 @@ def read_correspondences(path: str | Path) -> ImageCorrespondences:
 
 
 def _read_csv(path: Path) -> ImageCorrespondences:
-    table: dict[str, list[float]] = {name: [] for name in (*_COLUMNS, "weight")}
-    for line, row in read_csv(path, _COLUMNS, optional=("weight",)).items():
-        for name in (name for name in table if name in row):
-            value = math.nan
+    rows: list[list[float]] = []
+    for line, cells in read_csv(path, _COLUMNS, optional=("weight",)).items():
+        rows.append([])
+        for name in (*_COLUMNS, "weight"):
+            text, value = cells.get(name, "1"), math.nan
             with suppress(ValueError):
-                value = float(row[name])
+                value = float(text)
             if not math.isfinite(value) or (name == "weight" and value < 0):
                 wanted = "a number of at least 0" if name == "weight" else "a finite number"
-                raise InputError(path, f"{name} must be {wanted}, got {row[name][:40]!r}", line)
-            table[name].append(value)
-    x, y, z, u, v, weights = (torch.tensor(column, dtype=torch.float64) for column in table.values())
-    return ImageCorrespondences(torch.stack((x, y, z), 1), torch.stack((u, v), 1), weights if len(weights) else None)
+                raise InputError(path, f"{name} must be {wanted}, got {text[:40]!r}", line)
+            rows[-1].append(value)
+    world_points, img_points, weights = torch.tensor(rows, dtype=torch.float64).view(-1, 6).split((3, 2, 1), 1)
+    return ImageCorrespondences(world_points, img_points, weights[:, 0])
 
 
 def _read_npz(path: Path) -> ImageCorrespondences:
@@ -95,6 +94,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
     if arrays["world_points"].ndim == 3:
         raise InputError(path, f"world_points of {arrays['world_points'].shape} are many problems: pass --batch")
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
+    arrays.setdefault("weights", np.ones(count, np.float32))
     # A file of float32 is solved in float32, so that the solver knows the precision of the points.
     dtype = np.float32 if np.result_type(np.float32, *arrays.values()) == np.float32 else np.float64
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}

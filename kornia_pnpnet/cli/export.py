@@ -40,8 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     pairs = arguments.pairs if arguments.pairs is None or len(arguments.pairs) > 1 else arguments.pairs[0]
     is_onnx = target.suffix == ".onnx"
     print(f"Tracing and {'converting' if is_onnx else 'compiling'}; PyTorch takes a minute or more", flush=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # PyTorch's exporter warns about its own code
+    with warnings.catch_warnings(action="ignore"):  # PyTorch's exporter warns about its own code
         write = export.export_onnx if is_onnx else export.export_package
         path = write(solver, target, pairs, batch=arguments.batch, rig=arguments.rig)
     outputs = export.OUTPUTS if solver.focal == "known" else export.ExportedCamera._fields

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,8 +73,8 @@ def solve_shards(
             shard has results of another solver.
         OSError: when the results cannot be written.
     """
-    state = sorted(solve.solver.state_dict().items())
-    mark = json.dumps({"name": name, "parameters": digest(*(part for item in state for part in item))}).encode()
+    parameters = digest(*chain.from_iterable(sorted(solve.solver.state_dict().items())))
+    mark = json.dumps({"name": name, "parameters": parameters}).encode()
     waiting, kept = {}, 0
     for stem, shard in _find(sources, Path(out)).items():
         target = Path(out) / f"{stem}.parquet"
@@ -83,14 +84,14 @@ def solve_shards(
             kept += 1
         else:
             raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
-    counts, failed = [(0, 0)], []
+    counts, failed = np.zeros(2, int), []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
             try:
-                counts.append(_solve_shard(solve, shard, target, mark, batch, bar))
+                counts += _solve_shard(solve, shard, target, mark, batch, bar)
             except InputError as error:
                 failed.append(str(error))
-    solved, problems = map(sum, zip(*counts, strict=True))
+    solved, problems = counts.tolist()
     return ShardReport(solved, problems, len(waiting) - len(failed), kept, failed)
 
 
@@ -134,10 +135,11 @@ def _bar(shards: Iterable[Path], shown: bool) -> Any:
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
-    """Solve a shard; return the number of solved problems and the number of all problems."""
+    """Solve a shard, and return the numbers of solved problems and of all problems."""
     solved, count, writer = 0, 0, None
+    tables = _tables_of_arrays if shard.suffix == ".npz" else _tables_of_parquet
     with atomic_open(target, "wb") as file, ExitStack() as stack:
-        for table in _tables_of_arrays(shard, batch) if shard.suffix == ".npz" else _tables_of_parquet(shard, batch):
+        for table in tables(shard, batch):
             try:
                 result = solve(table)
             except (BaseError, TypeError, pa.ArrowException) as error:  # a column is missing or does not fit the solver
@@ -146,7 +148,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
                 schema = result.schema.with_metadata({_SOLVER: mark})
                 writer = stack.enter_context(parquet.ParquetWriter(file, schema))
             writer.write_table(result)
-            solved, count = solved + (compute.sum(result["ok"]).as_py() or 0), count + len(result)
+            solved, count = solved + compute.sum(result["ok"], min_count=0).as_py(), count + len(result)
             if bar is not None:
                 bar.update(len(result))
     return solved, count

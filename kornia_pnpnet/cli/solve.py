@@ -98,7 +98,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
 
     from kornia_pnpnet import Status, diagnose
     from kornia_pnpnet.cameras import reproject
-    from kornia_pnpnet.cli.correspondence_files import InputError, read_correspondences
+    from kornia_pnpnet.cli.correspondence_files import read_correspondences
+    from kornia_pnpnet.core.files import InputError
 
     (path,), name, plot = arguments.file, arguments.solver, arguments.plot
     matches = read_correspondences(path)
@@ -114,15 +115,16 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     focal = getattr(solver, "focal", "known")
     if arguments.diagnose and focal == "unknown":
         raise ValueError("--diagnose needs a known focal length")
-    used = torch.ones(len(world_points)).bool() if weights is None else weights > 0
+    used = weights > 0
     diagnosis = str(diagnose(world_points[used], img_points[used], camera)) if arguments.diagnose else None
     with torch.no_grad():
-        result = solver(*pairs, camera[None], None if weights is None else weights[None])
+        result = solver(*pairs, camera[None], weights[None])
         uncertain = {"focal": focal, "focal_sigma": getattr(solver, "focal_sigma", None)}
         covariance = result.covariance(*pairs, result.intrinsics, **uncertain)
     camera, ok, status = result.intrinsics[0], bool(result.ok), Status(int(result.status)).name.lower()
     pixels = reproject(world_points, camera, result.pose)[0]
     errors, limit = (pixels - img_points).norm(dim=-1), arguments.threshold
+    inliers, sigma = int(result.inliers.sum()), result.sigma.item()
     rejected = ~(result.inliers[0] if limit is None else errors <= limit) | ~result.ok  # without a pose all pairs
     deviations = torch.where(result.ok, covariance[0].diagonal().sqrt(), torch.nan)
     answer = {
@@ -130,8 +132,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         "n": len(world_points),
         "ok": ok,
         "status": status,
-        "inliers": int(result.inliers.sum()),
-        "sigma_px": result.sigma.item(),
+        "inliers": inliers,
+        "sigma_px": sigma,
         "probability": result.probability.item(),
         "rotation": result.rotation[0].tolist(),
         "rotation_sigma_deg": _finite(deviations[:3].rad2deg()),
@@ -158,9 +160,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         plot_pose(plot, img_points, pixels, rejected, name if ok else f"{name}: NOT SOLVED")
     doubts = []
     if status in ("solved", "not_believed"):
-        inliers, count, sigma = int(result.inliers.sum()), int(used.sum()), result.sigma.item()
-        if inliers < _LEAST_SHARE * count:
-            doubts.append(f"only {inliers} of {count} correspondences agree with the pose")
+        if inliers < _LEAST_SHARE * int(used.sum()):
+            doubts.append(f"only {inliers} of {int(used.sum())} correspondences agree with the pose")
         if sigma > _MOST_NOISE_PX:
             doubts.append(f"the inliers show {sigma:.3g} px of noise, more than {_MOST_NOISE_PX:g}")
     reason = f"{' and '.join(doubts)}: {_MISTAKES}" if doubts else _ADVICE.get(status)

@@ -95,10 +95,8 @@ def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name:
 def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
     """Choose the dtype of a computation: float64 if any tensor is float64, else float32. ``None`` is ignored.
 
-    Half precision would be too coarse for pixels, and integers would have no gradient.
-
-    Raises:
-        TypeCheckError: when a tensor holds booleans or complex numbers.
+    Half precision would be too coarse for pixels, and integers have no gradient. ``TypeCheckError``: a tensor holds
+    booleans or complex numbers.
     """
     given = {name: tensor.dtype for name, tensor in tensors.items() if tensor is not None}
     for name, dtype in given.items():

@@ -14,13 +14,6 @@ class Configured(nn.Module):
 
     Args:
         arguments: the result of ``locals()`` at the start of the subclass's constructor, before any assignment.
-
-    Example:
-        >>> class Scale(Configured):
-        ...     def __init__(self, factor: float = 2.0) -> None:
-        ...         super().__init__(locals())
-        >>> Scale().config, Scale()
-        ({'factor': 2.0}, Scale(factor=2.0))
     """
 
     def __init__(self, arguments: Mapping[str, Any]) -> None:

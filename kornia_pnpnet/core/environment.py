@@ -22,10 +22,9 @@ def environment() -> dict[str, Any]:
     """Describe the software and the machine of a measurement.
 
     Returns:
-        A dictionary. ``versions`` maps each package to its version, or to ``None`` if the package is not installed.
-        ``threads`` is the number of threads of PyTorch. ``gpu`` is ``None`` without a GPU. ``date`` is in UTC.
-        ``commit`` is the commit of the git checkout that contains the package, or ``None`` outside of a checkout. The
-        commit ends with ``+`` if tracked files have changes. The other keys are ``python``, ``platform`` and ``cpu``.
+        ``versions`` by package (``None``: not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
+        ``gpu`` (``None``: no GPU), ``date`` in UTC, and the git ``commit`` of the package (``None``: no checkout),
+        which ends with ``+`` if tracked files have changes.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},
@@ -64,13 +63,9 @@ def _cpu_name() -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the git checkout whose source tree contains this file, ``None`` for an installed copy."""
     root = Path(__file__).resolve().parents[2]
-    git = ["git", "-C", str(root)]
-    with suppress(OSError, ValueError, subprocess.SubprocessError):
-        top, commit = subprocess.check_output(
-            [*git, "rev-parse", "--show-toplevel", "HEAD"], text=True, stderr=subprocess.DEVNULL, timeout=10
-        ).splitlines()
-        changed = subprocess.check_output([*git, "status", "--porcelain", "--untracked-files=no"], timeout=10)
-        return commit + "+" * bool(changed) if Path(top).resolve() == root else None
+    if (root / ".git").exists():
+        git = ["git", "-C", str(root), "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
+        with suppress(OSError, subprocess.SubprocessError):
+            return subprocess.check_output(git, text=True, stderr=subprocess.DEVNULL, timeout=10).strip()
     return None

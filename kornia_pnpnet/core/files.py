@@ -56,11 +56,9 @@ def write_json(path: str | Path, content: Any) -> None:
 def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] = ()) -> dict[int, dict[str, str]]:
     """Read a CSV file with a header, and map the line number of each row to its cells by column name.
 
-    Blank lines and spaces around cells are dropped. Columns other than ``columns`` and ``optional`` are kept.
-
-    Raises:
-        InputError: when the file is not CSV in UTF-8, a required column is missing, a required or optional column
-            occurs twice, or the number of cells differs between a row and the header.
+    Blank lines and spaces around cells are dropped. Further columns are kept. ``InputError``: the file is not CSV in
+    UTF-8, one of ``columns`` is missing, one of ``columns`` or ``optional`` occurs twice, or a row has more or fewer
+    cells than the header.
     """
     content = Path(path).read_bytes()
     try:
@@ -82,11 +80,10 @@ def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] =
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the named arrays of an NPZ file that the file has, ``None``: all, without unpickling.
+    """Read those of the named arrays (``None``: all arrays) that an NPZ file has, without unpickling.
 
-    Raises:
-        ValueError: when the file is not an NPZ file of numbers, or when the arrays take more than :data:`MOST_BYTES`.
-            The message does not name the file.
+    ``ValueError``, whose message does not name the file: it is not an NPZ file of numbers, or the arrays take more than
+    :data:`MOST_BYTES`.
     """
     with path.open("rb") as file:
         try:

@@ -68,20 +68,18 @@ if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even i
 def in_turn(x: Tensor) -> AbstractContextManager[Any]:
     """Return a context in which threads run one after the other, if ``x`` has few numbers (see :func:`are_few`).
 
-    Four threads that wait for Python's lock at every operation are together two and a half times slower than one.
+    Otherwise four threads, which wait for Python's lock at every operation, take 2.5 times the time of one thread.
     """
     return _TURN[0] if are_few(x) else nullcontext()
 
 
-# Numbers. For fewer numbers on a CPU, the call of an operation takes longer than its arithmetic.
+# Numbers. For fewer numbers on a CPU, the call of an operation takes longer than its arithmetic. One 6×6 system is
+# solved by LAPACK in 55 µs, and by a loop over its entries in 293 µs.
 _FEW_NUMBERS = 4096
 
 
 def are_few(x: Tensor) -> bool:
-    """Whether the code is uncompiled and the tensor is small and on a CPU. Calls then take longer than arithmetic.
-
-    LAPACK then replaces loops over entries: one 6×6 system takes 55 instead of 293 µs.
-    """
+    """Whether the code is uncompiled and the tensor is small and on a CPU. LAPACK then replaces loops over entries."""
     return not compiling() and x.device.type == "cpu" and x.numel() <= _FEW_NUMBERS
 
 
@@ -113,17 +111,16 @@ def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
 
-# Bytes. The largest mmap threshold of glibc, 32 MiB (mallopt(3), M_MMAP_THRESHOLD), minus 64 KiB for the header of the
-# allocation.
+# Bytes: the largest mmap threshold of glibc, 32 MiB (mallopt(3), M_MMAP_THRESHOLD), minus the header of an allocation.
 _LARGEST_KEPT = 2**25 - 2**16
 
 
 def keep_freed_memory() -> None:
     """Let glibc keep up to 64 MiB of freed memory for reuse, in the whole process.
 
-    By default glibc requests memory from the system for each tensor of more than 128 KiB. With ``pnpnet-set`` on a CPU,
-    batches of at least 1000 problems then take 20 to 45 % longer. Only the command ``pnpnet`` and the benchmarks call
-    this function: a library must not change the allocator of its process.
+    Otherwise glibc requests memory from the system for each tensor of more than 128 KiB: large batches of
+    ``pnpnet-set`` take 20 to 45 % longer. Only programs may call this function, because a library must not change the
+    allocator of its process.
     """
     torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")  # freed at once; its pages are never written
 
@@ -131,8 +128,7 @@ def keep_freed_memory() -> None:
 # --- order ------------------------------------------------------------------------------------------------------------
 
 # Pairs. Up to this number of pairs, compiled code sorts by comparisons, which compile to one loop. For 9 pairs in each
-# of 1000 problems, the loop takes 31 µs and `Tensor.sort` 65 µs; with two keys, 60 and 200 µs. Uncompiled code calls
-# `Tensor.sort`, because the many calls of the loop take longer.
+# of 1000 problems, the loop takes 31 µs and `Tensor.sort` 65 µs; with two keys, 60 and 200 µs.
 _FEW_PAIRS = 12
 
 
@@ -171,12 +167,7 @@ def _sorted_rows(values: Tensor) -> list[Tensor]:
 
 
 def present_first(present: Tensor) -> Tensor:
-    """Find positions (B, N) that move present pairs before absent pairs, without any other change of order.
-
-    Example:
-        >>> present_first(torch.tensor([[False, True, True]]))
-        tensor([[1, 2, 0]])
-    """
+    """Find positions (B, N) that move present pairs before absent pairs, without any other change of order."""
     places = torch.arange(present.shape[1], device=present.device)
     # The keys are unique, because PyTorch's top-k is not stable.
     return _ascending(torch.where(present, places, places + present.shape[1]))
@@ -265,23 +256,18 @@ class Runner:
 
     def __init__(self, compiled: bool = False, mode: str | None = None) -> None:
         self.compiled, self.mode = compiled, mode
+        self.failed: set[str] = set()  # names of functions whose compilation failed
         # Keys of `_functions`: name of the function, and whether problems have at least `_MANY_PAIRS` pairs.
         self._functions: dict[tuple[str, bool], Callable[..., Any]] = {}
         self._seen: set[tuple[Any, ...]] = set()
-        self._failed: set[str] = set()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy or pickle without compiled code. Copies and other processes compile again."""
         return type(self), (self.compiled, self.mode)
 
-    @property
-    def failed(self) -> bool:
-        """Whether the compilation of any function has failed."""
-        return bool(self._failed)
-
     def __call__(self, function: Callable[..., _T], *args: Any) -> _T:
         """Call a function."""
-        if not self.compiled or compiling() or function.__qualname__ in self._failed:
+        if not self.compiled or compiling() or function.__qualname__ in self.failed:
             return function(*args)
         tensors = list(iter_tensors(args))
         name, first = function.__qualname__, tensors[0]
@@ -296,8 +282,7 @@ class Runner:
             for tensor in tensors:
                 if tensor.ndim and tensor.shape[0] > 1:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the compiler warns about its own code
+            with warnings.catch_warnings(action="ignore"):  # the compiler warns about its own code
                 result: _T = self._functions[name, many](*args)
             self._seen.add(kind)
             return result
@@ -305,18 +290,18 @@ class Runner:
             raise
         except Exception as error:  # the compiler raises many types of errors
             result = function(*args)  # an invalid call raises its own error here
-            self._failed.add(name)
+            self.failed.add(name)
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"Not compiled, running uncompiled. {reason[:300]}", RuntimeWarning, stacklevel=3)
             return result
 
     def _compile(self, function: Callable[..., Any], many: bool) -> Callable[..., Any]:
-        # `vec_isa_ok` skips tests of the C++ compiler for each instruction set. These tests take half of the time of
-        # the first compilation. Without `enable_loop_tail_vec` a loop ends with scalar code instead of a second vector
-        # loop. Compilation then takes a third less time, and calls take the same time.
-        options = {**torch._inductor.list_mode_options(self.mode or "default"), "cpp.vec_isa_ok": True}
-        options.update({"cpp.enable_loop_tail_vec": False, "guard_filter_fn": _needs_check})
-        options.update({"pick_loop_orders": False} if many else {})
+        options = torch._inductor.list_mode_options(self.mode or "default") | {
+            "cpp.vec_isa_ok": True,  # skip tests of instruction sets, half of the time of the first compilation
+            "cpp.enable_loop_tail_vec": False,  # a third less time of compilation, and the same time of calls
+            "guard_filter_fn": _needed_guards,
+            **({"pick_loop_orders": False} if many else {}),
+        }
         # Each number of pairs and each dtype needs two compilations, with and without gradients. The limit applies to
         # each function separately.
         limits: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
@@ -327,13 +312,13 @@ class Runner:
         return lambda *args: map_tensors(torch.clone, run(*args))
 
 
-#: The runner that calls all functions uncompiled.
-EAGER = Runner()
-
-
-def _needs_check(guards: Sequence[Any]) -> list[bool]:
+def _needed_guards(guards: Sequence[Any]) -> list[bool]:
     """Skip the guards of global functions and constants, which never change. Each guard takes time at each call."""
     return [guard.guard_type == "DUPLICATE_INPUT" or not guard.is_global for guard in guards]
+
+
+#: The runner that calls all functions uncompiled.
+EAGER = Runner()
 
 
 def per_problem(scalar: Tensor, like: Tensor) -> Tensor:
@@ -354,7 +339,7 @@ def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
     """
     return {
         "aot_inductor.allow_stack_allocation": on_stack,
-        "cpp.vec_isa_ok": True,  # see `Compiled`
+        "cpp.vec_isa_ok": True,  # see `Runner`
         "cpp.threads": 1,  # the default is the number of threads of the compiling process
         "pick_loop_orders": pairs is not None and pairs < _MANY_PAIRS,
     }
@@ -362,8 +347,8 @@ def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
 
 # --- packages of one problem: sorts, running sums and products as elementwise operations ------------------------------
 # A compiler fuses elementwise operations, and calls PyTorch for all other operations. AOTInductor keeps the tensors of
-# a graph on the stack if the graph never calls PyTorch. Otherwise the allocation of small tensors takes most of the
-# time of one problem. A package of `pnpnet-n9` for one problem takes 42 µs with INLINE and 297 µs without INLINE.
+# a graph on the stack if the graph never calls PyTorch: a package of `pnpnet-n9` for one problem then takes 42 instead
+# of 297 µs.
 
 # Numbers. Longer sorts and cumulative sums remain calls of PyTorch. An inline sort compares all pairs of its numbers.
 _FEW_INLINE = 32

@@ -11,14 +11,9 @@ _T = TypeVar("_T")
 
 
 def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
-    """Apply a function to every tensor of nested tuples, named tuples and lists. Other values, as ``None``, stay.
+    """Apply a function to every tensor of nested tuples, named tuples and lists. Other values, such as ``None``, stay.
 
     With ``others``, trees of the same structure, the function receives one tensor from each tree.
-
-    Example:
-        >>> import torch
-        >>> map_tensors(torch.add, (torch.ones(2), None), (torch.ones(2), None))
-        (tensor([2., 2.]), None)
     """
     if isinstance(tree, Tensor):
         return function(tree, *others)

@@ -46,12 +46,9 @@ A success has a rotation error below 1° and a translation error below 0.2. Inte
 
 
 def write_model_card(folder: str | Path, results: RunResults, *, name: str | None = None) -> None:
-    """Write ``README.md`` beside weights, with metadata for the Hugging Face Hub.
+    """Write ``README.md`` into the folder of weights, with metadata for the Hugging Face Hub.
 
-    Args:
-        folder: folder of the weights.
-        results: results of the run that trained the weights.
-        name: name of the weights; the name of the run when ``None``.
+    ``results`` are those of the run that trained the weights. ``name`` names the weights; ``None``: as the run.
     """
     from huggingface_hub import EvalResult, ModelCardData
 

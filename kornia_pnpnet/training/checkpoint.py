@@ -17,17 +17,6 @@ from torch.utils.tensorboard import SummaryWriter
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.evaluation.results import differences
 
-__all__ = [
-    "CHECKPOINT_NAME",
-    "HISTORY_NAME",
-    "History",
-    "StageClock",
-    "TrainingError",
-    "load_checkpoint",
-    "stop_on_signal",
-    "write_csv",
-]
-
 CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
 
 
@@ -80,8 +69,7 @@ class History:
     """Learning curves in a CSV file and TensorBoard. Rows of an earlier call are kept up to the update ``start``."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
-        self._path = folder / HISTORY_NAME
-        self._columns = columns
+        self._path, self._columns = folder / HISTORY_NAME, columns
         rows: list[dict[str, Any]] = []
         if start and self._path.is_file():
             with self._path.open(newline="") as file:  # a crash can cut the last row
@@ -102,9 +90,7 @@ class History:
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Raises:
-        TrainingError: when the file is damaged, or when ``identity`` differs from the identity in the file, except by
-            a larger number of updates.
+    ``TrainingError``: the file is damaged, or its identity differs from ``identity``, which may have more updates.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)

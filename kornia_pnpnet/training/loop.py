@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from kornia.core.check import KORNIA_CHECK
 from lightning_fabric import Fabric
-from torch import Tensor, nn
+from torch import nn
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
@@ -55,10 +55,8 @@ _log = logging.getLogger(__name__)
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
 _REFINES = "with refinement"  # label of the progress bar
 # Columns of the learning curves, except the columns of validations.
-_COLUMNS = (
-    *("update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"),
-    *(*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"),
-)
+_COLUMNS = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
+_COLUMNS += [*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"]
 # Columns of a validation without the prefix ``val/<set>/``, and the attribute of ValidationResult in each column.
 _CURVES = {
     "success": "success.rate",
@@ -207,6 +205,25 @@ def fit(
     batches = stream_batches(data, start, settings.updates, data_workers)
     clock = StageClock(*_STAGES)
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
+
+    def report(since: int, before: Mapping[str, float]) -> FitReport:
+        """Report the work since an update at which the clock had the seconds ``before``."""
+        clock.lap("rest")
+        spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
+        whole = sum(spent.values())
+        on_gpu = fabric.device.type == "cuda"
+        peak_bytes = torch.cuda.max_memory_allocated(fabric.device) if on_gpu else peak_resident_bytes()
+        return FitReport(
+            start=since,
+            update=update,
+            skipped=skipped,
+            interrupted=interrupted,
+            seconds=whole,
+            updates_per_second=(update - since) / whole,
+            time_shares={stage: seconds / whole for stage, seconds in spent.items()},
+            peak_memory_mib=peak_bytes / 2**20,
+        )
+
     with stop_on_signal() as stop, closing(batches), bar, logging_redirect_tqdm():
         for update, batch in enumerate(batches, start + 1):
             problems = batch.map(lambda x: x[part].to(fabric.device))
@@ -228,7 +245,8 @@ def fit(
             clock.lap("backward")
             norm = nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
             # All processes must take the same branch, even if only one process has a bad loss or got a signal.
-            bad, stopped = _any_process(fabric, ~torch.isfinite(terms.total + norm), stop.is_set())
+            flags = torch.stack((~(terms.total + norm).isfinite(), torch.tensor(stop.is_set(), device=fabric.device)))
+            bad, stopped = (torch.as_tensor(fabric.all_reduce(flags.float(), reduce_op="sum")) > 0).tolist()
             if bad:
                 skipped += 1
                 if fabric.is_global_zero:
@@ -249,13 +267,13 @@ def fit(
             if validates or update % settings.log_every == 0:
                 values = torch.as_tensor(fabric.all_reduce(torch.stack(terms).detach(), reduce_op="mean"))
                 if history is not None:
-                    report = _report(fabric, clock, *logged, update, skipped)
+                    interval = report(*logged)
                     row = {"update": update, **dict(zip(LossTerms._fields, values.tolist(), strict=True))}
                     if ramp == 0.0:  # results are not refined before the ramp
                         row = {name: value for name, value in row.items() if not name.startswith("refined")}
                     row |= {"ramp": ramp, "lr": settings.lr * factor, "grad_norm": norm.item(), "skipped": skipped}
-                    row |= {name: getattr(report, name) for name in ("updates_per_second", "peak_memory_mib")}
-                    row |= {f"{stage}_share": share for stage, share in report.time_shares.items()}
+                    row |= {name: getattr(interval, name) for name in ("updates_per_second", "peak_memory_mib")}
+                    row |= {f"{stage}_share": share for stage, share in interval.time_shares.items()}
                     if validates:
                         bar.set_postfix_str("validating")
                         model.eval()
@@ -265,7 +283,7 @@ def fit(
                             row |= {f"val/{name}/{key}": attrgetter(field)(result) for key, field in _CURVES.items()}
                         rates = ", ".join(f"{name} {100 * x.success.rate:.1f} %" for name, x in results.items())
                         bar.set_postfix_str(rates)
-                        _log.info("%s; success: %s", report, rates)
+                        _log.info("%s; success: %s", interval, rates)
                     history.write(row)
                     clock.lap("rest")
                     logged = update, dict(clock.seconds)
@@ -282,7 +300,7 @@ def fit(
     if history is not None:
         history.board.close()
     model.eval()
-    return _report(fabric, clock, start, dict.fromkeys(_STAGES, 0.0), update, skipped, interrupted)
+    return report(start, dict.fromkeys(_STAGES, 0.0))
 
 
 def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: float) -> LossTerms:
@@ -294,49 +312,11 @@ def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: fl
     return loss(solver(*problems[:3], **options), problems, ramp)
 
 
-def _any_process(fabric: Fabric, *flags: bool | Tensor) -> list[bool]:
-    """Whether each flag is set on at least one process."""
-    counts = torch.stack([torch.as_tensor(flag, dtype=torch.float32, device=fabric.device) for flag in flags])
-    return (torch.as_tensor(fabric.all_reduce(counts, reduce_op="sum")) > 0).tolist()
-
-
-def _report(
-    fabric: Fabric,
-    clock: StageClock,
-    start: int,
-    before: Mapping[str, float],
-    update: int,
-    skipped: int,
-    interrupted: bool = False,
-) -> FitReport:
-    """Report the work since the update ``start``. ``before`` holds the clock's seconds at the update ``start``."""
-    clock.lap("rest")
-    spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
-    whole = sum(spent.values())
-    on_gpu = fabric.device.type == "cuda"
-    peak_bytes = torch.cuda.max_memory_allocated(fabric.device) if on_gpu else peak_resident_bytes()
-    return FitReport(
-        start=start,
-        update=update,
-        skipped=skipped,
-        interrupted=interrupted,
-        seconds=whole,
-        updates_per_second=(update - start) / whole,
-        time_shares={stage: seconds / whole for stage, seconds in spent.items()},
-        peak_memory_mib=peak_bytes / 2**20,
-    )
-
-
 def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) -> Path:
-    """Train a new PnP-Net for n = 9 for a short time, and return the path of the learning curves (CSV).
+    """Train a new PnP-Net for n = 9 for about ``seconds``, and return the path of the learning curves (CSV).
 
-    Args:
-        seconds: approximate duration. The number of updates follows from a short measurement of the machine's speed.
-        folder: folder of the run. An earlier run in this folder is replaced.
-        progress: show a progress bar.
-
-    Raises:
-        BaseError: when ``seconds`` is not a positive number.
+    The number of updates follows from a short measurement of the machine's speed. An earlier run in ``folder`` is
+    replaced. ``BaseError``: ``seconds`` is not a positive number.
     """
     check_positive(seconds=seconds)
     folder = Path(folder)

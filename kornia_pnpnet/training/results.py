@@ -95,7 +95,7 @@ class Learned(NamedTuple):
     robustness: list[float]
 
 
-# The keys that model cards and summaries read. The mappings can have further keys.
+# The keys that readers need. The mappings can have further keys.
 _Init = TypedDict("_Init", {"name": str})
 _Refine = TypedDict("_Refine", {"m": Count})
 _Size = TypedDict("_Size", {"n": Count})
@@ -214,14 +214,8 @@ def load_run(path: str | Path) -> RunResults:
 def find_results(weights: str | Path) -> RunResults | None:
     """Load the results of the run that trained some weights; ``None`` if there is no results file.
 
-    The file is in the folder of the weights or, if this folder has the name ``weights``, in the parent folder.
-
-    Args:
-        weights: name or folder of the weights, see :func:`~kornia_pnpnet.pretrained.find_weights`.
-
-    Raises:
-        FileNotFoundError: when the weights do not exist.
-        ValueError: see :func:`load_run`.
+    The file is in the folder of the weights or, if this folder has the name ``weights``, in the parent folder. For the
+    argument and the errors see :func:`~kornia_pnpnet.pretrained.find_weights` and :func:`load_run`.
     """
     folder = find_weights(weights)
     # `train.py` writes weights into the folder `weights` of a run. Another folder can lie beside unrelated results.

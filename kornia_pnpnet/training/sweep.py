@@ -12,8 +12,6 @@ from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.training.card import HOW_IT_RAN
 
-__all__ = ["SweepTable"]
-
 # Overrides precede this column of a summary.
 _FIRST_RESULT = "update"
 
