@@ -287,16 +287,17 @@ class PackagedSolver:
         cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
         intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
-        inputs = world_points, img_points, intrinsics, weights, *(cam_from_rig or ())
+        inputs = [world_points, img_points, intrinsics, weights, *(cam_from_rig or ())]
         check_shapes(dict(zip(RIG_INPUTS, zip(inputs, shapes, strict=False), strict=False)))
+        inputs = [x.to("cpu", torch.float32) for x in inputs]
         if n < size:  # padding: the last pair again, with a weight of 0
-            pair = torch.arange(size, device=weights.device).clamp(max=n - 1)
-            inputs = tuple(x if x is intrinsics and not self.rig else x.index_select(1, pair) for x in inputs)
+            pair = torch.arange(size).clamp(max=n - 1)
+            inputs = [x if i == 2 and not self.rig else x.index_select(1, pair) for i, x in enumerate(inputs)]
             inputs[3][:, n:] = 0.0
-        # Compiled code does not check dtypes and strides. Results are copied, because the next call may overwrite them.
-        results = self._runs[size]([x.to("cpu", torch.float32).contiguous() for x in inputs])
-        kind = ExportedResult if len(results) == len(OUTPUTS) else ExportedCamera
-        return kind(*[x.clone() for x in results])._replace(pair_weights=results[2][:, :n].clone())
+        # Compiled code does not check strides. Results are copied, because the next call may overwrite them.
+        rotation, translation, weights, *others = self._runs[size]([x.contiguous() for x in inputs])
+        results = [x.clone() for x in (rotation, translation, weights[:, :n], *others)]
+        return (ExportedResult if len(results) == len(OUTPUTS) else ExportedCamera)(*results)
 
 
 def load_package(path: str | Path) -> PackagedSolver:
