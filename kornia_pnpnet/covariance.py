@@ -14,9 +14,8 @@ from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, State
-from kornia_pnpnet.refine.information import pixel_precision
-from kornia_pnpnet.refine.residual import normal_equations, pixel_variance, project
+from kornia_pnpnet.problem import MIN_PAIRS, Noise, State
+from kornia_pnpnet.refine.residual import information, normal_equations, pixel_variance, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
 from kornia_pnpnet.result import Pose, PosePrior, gate_pose
 
@@ -116,11 +115,10 @@ def pose_covariance(
     size_of_camera = 0 if focal == "known" else 1
     state = State(framed_pose, problem.weights.new_zeros(len(problem.weights), size_of_camera))
     projection, inlier = project(state, problem), _inlier_probability(problem.weights)
-    noise = problem.noise
-    known = ((noise.img + noise.world).isfinite() | (problem.weights == 0)).all(1)
-    least = noise.img.nan_to_num(1.0).maximum(LEAST_NOISE * problem.focal)
-    noise = noise._replace(img=least, world=noise.world.nan_to_num(0.0))
-    precision = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
+    known = ((problem.noise.img + problem.noise.world).isfinite() | (problem.weights == 0)).all(1)
+    noise = map_tensors(lambda x: x.nan_to_num(0.0), problem.noise).bounded(problem.focal)
+    precision = information(projection, problem._replace(noise=noise))[1]
+    precision = map_tensors(lambda x: inlier * x, precision)
     equations, determined = normal_equations(projection, problem, precision), posed & known
     if size_of_camera:
         plane, pixels = projection.plane, problem.img_points.permute(2, 1, 0) / problem.focal
@@ -135,18 +133,18 @@ def pose_covariance(
     if inputs.prior is not None:
         framed, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
         equations, determined = add_term(equations, framed.linearise(state), problem.focal), determined & usable
-    information = equations.matrix.permute(2, 0, 1) * problem.focal.square()
-    eye = torch.eye(information.shape[-1], dtype=information.dtype, device=information.device)
+    matrix = equations.matrix.permute(2, 0, 1) * problem.focal.square()
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     with torch.no_grad():
-        unit = information.diagonal(dim1=1, dim2=2).rsqrt()
-        correlation = unit[:, :, None] * information * unit[:, None]
+        unit = matrix.diagonal(dim1=1, dim2=2).rsqrt()
+        correlation = unit[:, :, None] * matrix * unit[:, None]
         is_definite = torch.linalg.cholesky_ex(correlation - _LEAST_EIGENVALUE * eye).info == 0
         determined = (determined & is_definite & correlation.isfinite().all((1, 2)))[:, None, None]
-    inverse = torch.linalg.inv_ex(torch.where(determined, information, eye)).inverse
+    inverse = torch.linalg.inv_ex(torch.where(determined, matrix, eye)).inverse
 
     # Back to the caller's world: omega does not change, v = size v_framed + (R centroid) x omega.
     rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
-    back = eye.repeat(len(information), 1, 1)
+    back = eye.repeat(len(matrix), 1, 1)
     back[:, 3:6, :3] = So3.hat(rotated_centroid)
     back[:, 3:6, 3:6] *= frame.size[:, None, None]
     if size_of_camera:  # the depth of the centroid grows with the focal length, see `refine.residual.moved`

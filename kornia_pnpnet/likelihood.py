@@ -19,11 +19,10 @@ from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.problem import LEAST_NOISE, Problem, Starts, State
-from kornia_pnpnet.refine.information import information
+from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import RobustWeightedLM
-from kornia_pnpnet.refine.residual import covariance_at, normal_equations, project, retract
+from kornia_pnpnet.refine.residual import covariance_at, information, normal_equations, project, retract
 from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
@@ -149,8 +148,7 @@ def monte_carlo_pose_loss(
     points = (inputs.world_points - frame.centroid[:, None]) / unit[..., None]
     problem, _ = Normalize(center=False, scale=False, order=False)(points, *inputs[1:5], noise)
     assert problem.noise is not None
-    least = problem.noise.img.maximum(LEAST_NOISE * problem.focal)  # as in solvers
-    problem = problem._replace(noise=problem.noise._replace(img=least))
+    problem = problem._replace(noise=problem.noise.bounded(problem.focal))
 
     axis = points.new_tensor([0.0, 0.0, 1.0])  # a refused problem gets a constant translation
     poses = [Pose(pose.rotation, torch.where(live[:, None], pose.translation, axis)) for pose, _ in started]

@@ -68,6 +68,10 @@ class Noise(NamedTuple):
     img_cov: Symmetric2 | None = None
     world_cov: Symmetric3 | None = None
 
+    def bounded(self, focal: Tensor) -> Noise:
+        """Raise the sigma of each pixel to at least :data:`LEAST_NOISE` times the focal length."""
+        return self._replace(img=self.img.maximum(LEAST_NOISE * focal))
+
     @property
     def sigmas(self) -> Noise:
         """The noise without covariances."""

@@ -17,7 +17,7 @@ from kornia_pnpnet import Pose
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.data import ObjectPoints, OutlierMix, SceneProblems, SyntheticProblems, load_scene
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.judge import belief, evidence
+from kornia_pnpnet.judge import evidence
 from kornia_pnpnet.propose import alternatives
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 
@@ -47,9 +47,9 @@ PARTS: dict[str, tuple[Any, str, Any]] = {
     "rival of larger noise": (alternatives, "_GAP", -math.inf),
     "rival of the search": (alternatives, "_APART", math.inf),
     "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
-    "limit of the pose's standard deviation": (belief, "_OPEN", math.inf),
-    "limit of the noise": (belief, "_MOST_NOISE", math.inf),
-    "points off a line": (belief, "_leave_a_line", _any_points),
+    "limit of the pose's standard deviation": (evidence, "_OPEN", math.inf),
+    "limit of the noise": (evidence, "_MOST_NOISE", math.inf),
+    "points off a line": (evidence, "_leave_a_line", _any_points),
 }
 
 

@@ -1,4 +1,4 @@
-"""Fit the law of ``PnPResult.probability``, see ``kornia_pnpnet.judge.belief``. ``make.py`` is the command.
+"""Fit the law of ``PnPResult.probability``, see ``kornia_pnpnet.judge.evidence``. ``make.py`` is the command.
 
 The coefficients go from ``probability.json`` into the code by hand; a test compares them.
 """
@@ -23,7 +23,7 @@ from torch import Tensor
 from kornia_pnpnet import PnPNet, Pose, Problems
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.judge import belief
+from kornia_pnpnet.judge import evidence
 from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
 
 #: The solvers of the fit, and other solvers that are only measured.
@@ -44,7 +44,7 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
     """
     law = fit_law([solved(name, kind) for name in FITTED for kind in kinds(seed_fit) if in_fit(kind)])
     made: dict[str, Any] = {"environment": environment(), "law": law}
-    with mock.patch.object(belief, "LAW", law):
+    with mock.patch.object(evidence, "LAW", law):
         for name in (*FITTED, *MEASURED):
             rows = {kind.name: (in_fit(kind), solved(name, kind)) for kind in kinds(seed_report)}
             fitted = [row for used, row in rows.values() if used]
@@ -112,9 +112,9 @@ def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
         turn, shift = errors(result.pose, kind.truth)
         shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
-    variables = torch.stack(belief.clipped(log_ratio, sigma), -1).double()
+    variables = torch.stack(evidence.clipped(log_ratio, sigma), -1).double()
     # A rival multiplies the probability of the law. The fit leaves out poses that fail a test, and poses with a rival.
-    alone = probability >= 0.99 * belief.probability(log_ratio, sigma)
+    alone = probability >= 0.99 * evidence.probability(log_ratio, sigma)
     found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right}
     return {**found, "variables": variables, "alone": alone & (probability > 0)}
 

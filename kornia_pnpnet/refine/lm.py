@@ -14,13 +14,28 @@ from kornia_pnpnet.core.linalg import relative, solve_positive
 from kornia_pnpnet.core.performance import EAGER, Runner, are_few, per_problem, problems_last, repeat_problems
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.belief import LEAST_PROBABILITY, believe, has_enough
-from kornia_pnpnet.judge.evidence import AtPose, Evidence, Mixture, Votes, at_pose, evidence, updated
-from kornia_pnpnet.problem import Problem, Starts, State
-from kornia_pnpnet.refine.information import complete_noise, information, is_known, sq_standardised
-from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.parameters import BoundedParameter
-from kornia_pnpnet.refine.residual import NormalEquations, Projection, lm_step, moved, normal_equations, project
+from kornia_pnpnet.judge.evidence import (
+    LEAST_PROBABILITY,
+    AtPose,
+    Evidence,
+    Mixture,
+    Votes,
+    at_pose,
+    believe,
+    evidence,
+    updated,
+)
+from kornia_pnpnet.problem import MIN_PAIRS, Noise, Problem, Starts, State
+from kornia_pnpnet.refine.kernels import KERNELS, BoundedParameter, RobustKernel
+from kornia_pnpnet.refine.residual import (
+    NormalEquations,
+    Projection,
+    information,
+    lm_step,
+    moved,
+    normal_equations,
+    project,
+)
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
@@ -102,8 +117,8 @@ class Refinement(NamedTuple):
         cost: robust loss of pairs and terms, divided by the number of pairs, shape :math:`(B,)`.
         ok: whether the pose is to be believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
-        probability: see :func:`~kornia_pnpnet.judge.belief.probability`, shape :math:`(B,)`.
-        sigma: :func:`~kornia_pnpnet.judge.belief.pose_sigma`, float64, shape :math:`(B,)`.
+        probability: see :func:`~kornia_pnpnet.judge.evidence.probability`, shape :math:`(B,)`.
+        sigma: :func:`~kornia_pnpnet.judge.evidence.pose_sigma`, float64, shape :math:`(B,)`.
         evidence: the evidence for the pose.
     """
 
@@ -240,7 +255,7 @@ class RobustWeightedLM(Configured):
         """Refine poses.
 
         A pose is ``ok`` only if the equations of the last iteration could be solved, three pairs are in front of the
-        camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.belief.believe`).
+        camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.evidence.believe`).
 
         Args:
             problem: the problems.
@@ -255,9 +270,11 @@ class RobustWeightedLM(Configured):
     def begin(self, problem: Problem, starts: Starts) -> Plan:
         """Run everything before the first iteration. See :meth:`forward` for the arguments."""
         each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
-        known = is_known(problem)
         given = problem.noise
-        problem = problems_last(problem._replace(noise=complete_noise(problem, starts)))
+        known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
+        if given is not None:  # the caller gave a sigma of any pixel or world point
+            known = torch.stack(given[:2]).isfinite().any(-1).any(0)[:, None]
+        problem = problems_last(problem._replace(noise=_complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
         # A common factor of the weights does not change a step. The division prevents underflow of products of tiny
         # weights.
@@ -334,7 +351,7 @@ class RobustWeightedLM(Configured):
         if odds is not None:
             probability = probability * odds.sigmoid()
             ok = ok & (probability >= LEAST_PROBABILITY)
-        in_front = has_enough(seen.projection, plan.prior)
+        in_front = (seen.projection.in_front & (plan.prior > 0)).sum(-1) >= MIN_PAIRS
         return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
@@ -409,9 +426,13 @@ class RobustWeightedLM(Configured):
 
     def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
         """Robust loss of pairs and terms, divided by the number of pairs that have a weight, shape (B,)."""
+        sq_residual, precision = information(projection, problem)
+        # The bound in square pixels times the mean precision of both coordinates is the bound in variances.
         most = (_MAX_RESIDUAL * projection.focal).square().reshape(-1, 1)
+        most = most * (precision if isinstance(precision, Tensor) else 0.5 * (precision.uu + precision.vv))
+        sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
         count = (problem.weights > 0).sum(-1).clamp(min=1)
-        total = (prior * self.kernel.loss(sq_standardised(projection, problem, most), shape)).sum(-1)
+        total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
         unit = problem.img_scale.square() if problem.noise is None else 1.0  # without noise, sigma is one pixel
         for term in problem.terms:
             total = total + unit * term.loss(projection.state)
@@ -458,6 +479,18 @@ def taken(tree: _T, index: Tensor) -> _T:
         return x.movedim(0, -1).index_select(-1, index).movedim(-1, 0)
 
     return map_tensors(select, tree)
+
+
+def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
+    """The noise of every pair: sigmas of the initialiser, else of the caller, and the caller's covariances.
+
+    If the initialiser gave no noise, unknown sigmas become 0. ``None``: neither gave noise.
+    """
+    given = starts.noise if problem.noise is None else problem.noise
+    if given is None:
+        return None
+    noise = map_tensors(lambda x: x.nan_to_num(0.0), given) if starts.noise is None else starts.noise
+    return noise._replace(img_cov=given.img_cov, world_cov=given.world_cov).bounded(problem.focal)
 
 
 def _relative_to_mean(weights: Tensor) -> Tensor:

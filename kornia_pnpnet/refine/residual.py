@@ -32,6 +32,7 @@ __all__ = [
     "NormalEquations",
     "Projection",
     "covariance_at",
+    "information",
     "lm_step",
     "moved",
     "normal_equations",
@@ -203,6 +204,23 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
     if noise.img_cov is None:
         return Symmetric2(torch.addcmul(uu, noise.img, noise.img), uv, torch.addcmul(vv, noise.img, noise.img))
     return Symmetric2(uu + noise.img_cov.uu, uv + noise.img_cov.uv, vv + noise.img_cov.vv)
+
+
+def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
+    """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
+
+    With noise, which must be known for every pair, squared residuals are in variances of their pixel, and the
+    information is the inverse variance of each pixel, (B, N), or its inverse covariance if the noise has covariances.
+    Without noise, squared residuals are in square pixels, and the information is 1, (1, 1).
+    """
+    noise = problem.noise
+    if noise is None:
+        return projection.sq_residual, problem.weights.new_ones(1, 1)
+    if not noise.covariances:
+        precision = pixel_variance(projection, noise).reciprocal()
+        return projection.sq_residual * precision, precision
+    inverse = pixel_covariance(projection, problem, noise).inverse()
+    return inverse.form(*projection.residual.mT.unbind()), inverse
 
 
 def normal_equations(
