@@ -54,9 +54,9 @@ def pose_covariance(
     :math:`\Sigma_i` is the covariance of the pixel (:func:`~kornia_pnpnet.refine.residual.pixel_covariance`). The
     computation runs in float64. Gradients flow to all arguments.
 
-    A robust kernel gives most inliers a weight below 1. An M-estimate is nevertheless almost as accurate as least
-    squares on the inliers (P. Huber, "Robust Statistics", 1981). Let :math:`u_i` be the weight of pair :math:`i`. The
-    mean weight of an inlier is :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and :math:`w_i = \min(1, u_i / \bar u)`.
+    A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
+    least squares on the inliers (P. Huber, "Robust Statistics", 1981). The mean weight of an inlier is therefore
+    :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and :math:`w_i = \min(1, u_i / \bar u)`.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -114,7 +114,10 @@ def pose_covariance(
     pose = gate_pose(inputs.init, posed, posed)
     size_of_camera = 0 if focal == "known" else 1
     state = State(framed_pose, problem.weights.new_zeros(len(problem.weights), size_of_camera))
-    projection, inlier = project(state, problem), _inlier_probability(problem.weights)
+    projection = project(state, problem)
+    total = problem.weights.sum(-1, keepdim=True)
+    mean = problem.weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
+    inlier = (problem.weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)
     known = ((problem.noise.img + problem.noise.world).isfinite() | (problem.weights == 0)).all(1)
     noise = map_tensors(lambda x: x.nan_to_num(0.0), problem.noise).bounded(problem.focal)
     precision = information(projection, problem._replace(noise=noise))[1]
@@ -163,15 +166,7 @@ def shown_noise(
     The noise of a point moves its pixel by an amount that falls with the depth. The likeliest of five ratios between
     the noise of the points and the noise of the pixels is chosen, for residuals with a normal distribution.
 
-    Args:
-        pose: See pose_covariance.
-        world_points: See pose_covariance.
-        img_points: See pose_covariance.
-        intrinsics: See pose_covariance.
-        weights: See pose_covariance.
-
-    Returns:
-        ``img_sigma`` and ``world_sigma`` of :func:`pose_covariance`, shape :math:`(B,)` each.
+    For the arguments see :func:`pose_covariance`. Returns its ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
     """
     size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose")
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
@@ -190,10 +185,3 @@ def shown_noise(
     share, scale = share[best, 0], scale.gather(0, best[None])[0]
     img, world = (share * scale).sqrt() / problem.img_scale, ((1.0 - share) * scale / mean).sqrt() * frame.size
     return {"img_sigma": restore_leading(size, img.to(dtype)), "world_sigma": restore_leading(size, world.to(dtype))}
-
-
-def _inlier_probability(weights: Tensor) -> Tensor:
-    """The factors :math:`w` in :func:`pose_covariance`, (B, N)."""
-    total = weights.sum(-1, keepdim=True)
-    mean = weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
-    return (weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)

@@ -11,7 +11,6 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from kornia_pnpnet.arguments import checked_inputs
@@ -22,7 +21,7 @@ from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import RobustWeightedLM
-from kornia_pnpnet.refine.residual import covariance_at, information, normal_equations, project, retract
+from kornia_pnpnet.refine.residual import covariance_at, information, normal_equations, project, retract, tangent
 from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
@@ -209,12 +208,9 @@ class _Component(NamedTuple):
 
     def log_density(self, poses: Pose) -> Tensor:
         """Logarithm of the density per radian³ and unit³, (S, B)."""
-        turn = poses.rotation @ self.pose.rotation.mT
-        # The inverse of Cayley's map. The clamp avoids a division by 0 at a half turn.
-        cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-        omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
-        tangent = torch.cat((omega, poses.translation - self.pose.translation), -1)
-        sq_distance = (tangent[..., None, :] @ self.factor)[..., 0, :].square().sum(-1)
+        omega = tangent(poses.rotation @ self.pose.rotation.mT)
+        vector = torch.cat((omega, poses.translation - self.pose.translation), -1)
+        sq_distance = (vector[..., None, :] @ self.factor)[..., 0, :].square().sum(-1)
         log_determinant = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         # Cayley's map from tangent vectors to rotations multiplies volumes by 1 / (1 + |omega|² / 4)².
         return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * omega.square().sum(-1))
@@ -262,11 +258,9 @@ class _Posterior(NamedTuple):
         factor = problem.focal.square() * problem.weights * self.refine.kernel.weight(sq_residual, self.shape)
         weights = map_tensors(lambda x: factor * x, precision)
         matrix = normal_equations(projection, problem, weights).matrix.permute(2, 0, 1)
-        widest = (
-            torch.full_like(pose.translation, _WIDEST_ROTATION),
-            (_PRIOR_TRANSLATION * self.prior.distance).expand(-1, 3),
-        )
-        matrix = matrix + torch.diag_embed(torch.cat(widest, -1).square().reciprocal())
+        widest = torch.full_like(pose.translation, _WIDEST_ROTATION)
+        widest = torch.cat((widest, (_PRIOR_TRANSLATION * self.prior.distance).expand(-1, 3)), -1)
+        matrix = matrix + torch.diag_embed(widest.square().reciprocal())
         # The matrix is scaled to a unit diagonal, so that rounding does not depend on units.
         scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
         eye = torch.eye(6, dtype=scale.dtype, device=scale.device)

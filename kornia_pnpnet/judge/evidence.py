@@ -60,9 +60,8 @@ _LEAST_ANGLE, _STEP, _SCALES = 1e-4, 8.0, 6
 _UNEXPECTED = -3.0
 # Rounds of expectation and maximisation: for the share of inliers at each factor, and for the final factor and share.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
-# Real residuals have heavy tails. The model therefore has a second kind of inliers: the first number is their share of
-# all inliers, and the second number is the factor of their variance. With one kind of inliers, success on indoor RGB-D
-# matches falls by 2.5 points.
+# The second kind of inliers, for the heavy tails of real residuals: their share of all inliers, and the factor of their
+# variance. With one kind of inliers, success on indoor RGB-D matches falls by 2.5 points.
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
@@ -72,8 +71,7 @@ _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Number of poses of a minimal sample.
 _POSES = 4
 # Rows are sorted by a key, the sum of their columns times powers of this number, so that equal rows are adjacent. The
-# number is transcendental, so that different rows of integers have different keys. The powers are computed on the
-# device, because a CUDA graph cannot contain a copy from the CPU.
+# number is transcendental, so that different rows of integers have different keys.
 _KEY = math.pi / 4
 
 #: A pose is believed when its :func:`probability` is at least this value.
@@ -86,11 +84,10 @@ _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
 # Largest `pose_sigma` of a pose that is believed. Two standard deviations are the largest error of a correct pose.
 _OPEN = 0.5
-# Largest standard deviation of plausible noise in radians, or 13 pixels at a focal length of 800 pixels. With 0.0125,
-# 4 % of the right poses of indoor RGB-D matches (`rgbd/indoor.npz`, without a ratio test) would not be believed.
+# Radians. Largest standard deviation of plausible noise. With 0.0125, 4 % of the correct poses of indoor RGB-D matches
+# (`rgbd/indoor.npz`, without a ratio test) would not be believed.
 _MOST_NOISE = 0.016
-# A point lies off a line if its distance from the line exceeds this factor times the spread of the points. The spread
-# is the standard deviation of the points along the line.
+# A point lies off a line if its distance exceeds this factor times the standard deviation of the points along the line.
 _OFF = 0.05
 # With this number of inliers, one point off the line suffices. Each further inlier requires a further point, up to 3.
 _FEW = 5
@@ -104,8 +101,8 @@ class Votes(NamedTuple):
     Attributes:
         pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
         known: whether the caller gave the noise of a problem, bool (B, 1).
-        outlier: density of an outlier's pixel, divided by the density of a narrow inlier at the projection, if the
-            variance of the inlier is 1 px² and half of the pairs are inliers, (B, 1).
+        outlier: density of an outlier's pixel, divided by the density of a narrow inlier of variance 1 px² at the
+            projection, if half of the pairs are inliers, (B, 1).
     """
 
     pairs: Tensor
@@ -203,7 +200,7 @@ class Evidence(NamedTuple):
 
     @property
     def likelihood(self) -> Tensor:
-        """The largest entry of ``grid``, which compares poses of one problem, shape (B,)."""
+        """The largest entry of ``grid``, (B,), for the comparison of poses of one problem."""
         return self.grid.amax(1)
 
 
@@ -304,8 +301,7 @@ def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> t
 def probability(log_ratio: Tensor, sigma: Tensor) -> Tensor:
     """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The probability is a logistic function of the evidence ``log_ratio`` and of the logarithm of :func:`pose_sigma`,
-    both (B,).
+    It is a logistic function of the evidence ``log_ratio`` and of the logarithm of :func:`pose_sigma`, both (B,).
     """
     evidence, log_sigma = clipped(log_ratio, sigma)
     offset, by_evidence, by_sigma = LAW

@@ -16,7 +16,6 @@ from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.evidence import (
     LEAST_PROBABILITY,
-    AtPose,
     Evidence,
     Mixture,
     Votes,
@@ -58,17 +57,16 @@ _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
 
 class Plan(NamedTuple):
-    r"""The inputs of all iterations of a refinement.
+    r"""The inputs of all iterations of a refinement. Weights and sigmas have the shape :math:`(B, N)`.
 
     Attributes:
         problem: the problem with the caller's weights. Its noise is known for every pair or ``None``.
-        prior: weight of each pair without the robust weight, for the cost and the judge, :math:`(B, N)`: the caller's
-            weight, without iterations by residual times the initialiser's weight.
-        guided: the product of both weights, divided by the largest product, :math:`(B, N)`.
-        by_residual: the caller's weights divided by their mean, :math:`(B, N)`; without iterations by residual
-            ``guided``.
+        prior: weight of each pair without the robust weight, for the cost and the judge: the caller's weight, without
+            iterations by residual times the initialiser's weight.
+        guided: the product of both weights, divided by the largest product.
+        by_residual: the caller's weights divided by their mean; without iterations by residual ``guided``.
         state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second, ….
-        world_sigma: the caller's standard deviation of each point, 0 where unknown, :math:`(B, N)`.
+        world_sigma: the caller's standard deviation of each point, 0 where unknown.
         votes: votes of the pairs.
         hyperparameters: step, damping and shape of the kernel of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
@@ -90,10 +88,9 @@ class Plan(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What one iteration passes to the next: the states, whether the last equations could be solved, and more.
+    """What one iteration passes to the next: the states, and whether the last equations could be solved, bool (B,).
 
-    ``solved`` is bool of shape (B,). ``factor`` (B,) multiplies the damping. ``mixture`` is the distribution of the
-    residuals in iterations by residual.
+    ``factor`` (B,) multiplies the damping. ``mixture`` is the distribution of the residuals in iterations by residual.
     """
 
     state: State
@@ -146,8 +143,7 @@ class RobustWeightedLM(Configured):
     are learned. A problem that cannot be solved keeps its pose, and is not ``ok``.
 
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
-    pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is then in standard
-    deviations, and the cost in their squares.
+    pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is in standard deviations.
 
     *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser, the others the
     pose of the lowest cost, with the kernel of the last iteration that refined all poses.
@@ -171,8 +167,8 @@ class RobustWeightedLM(Configured):
             the choice among several poses.
         learnable: whether the hyperparameters are trained.
         backward: ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the implicit function theorem to
-            the last state, in a memory that does not grow with ``m``. This gradient is exact if the iterations have
-            converged. Step, damping and initial poses have no implicit gradient.
+            the last state, in a memory that does not grow with ``m``. This gradient is exact at a minimum. Step,
+            damping and initial poses have no implicit gradient.
 
     Raises:
         BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
@@ -209,7 +205,6 @@ class RobustWeightedLM(Configured):
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
-        self.kernel: RobustKernel = KERNELS[kernel]
         self.m = m
         self.explored = 7 * m // 10
         self.by_residual = min(by_residual, m - self.explored)
@@ -223,6 +218,11 @@ class RobustWeightedLM(Configured):
         bounds = {"lower": self.kernel.lower, "upper": self.kernel.upper}
         self.robustness = BoundedParameter(shape, size=size, **bounds, logarithmic=self.kernel.logarithmic)
         self.requires_grad_(learnable and m > 0)
+
+    @property
+    def kernel(self) -> RobustKernel:
+        """The robust kernel."""
+        return KERNELS[self.config["kernel"]]
 
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         r"""Step, damping and shape of the kernel of each iteration, like a tensor, :math:`(\max(m, 1),)` each."""
@@ -252,7 +252,7 @@ class RobustWeightedLM(Configured):
     def forward(
         self, problem: Problem, starts: Starts, *, m: int | None = None, more: int = 0, run: Runner = EAGER
     ) -> Refinement:
-        """Refine poses.
+        """Refine the poses of ``starts``.
 
         A pose is ``ok`` only if the equations of the last iteration could be solved, three pairs are in front of the
         camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.evidence.believe`).
@@ -276,11 +276,13 @@ class RobustWeightedLM(Configured):
             known = torch.stack(given[:2]).isfinite().any(-1).any(0)[:, None]
         problem = problems_last(problem._replace(noise=_complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
-        # A common factor of the weights does not change a step. The division prevents underflow of products of tiny
-        # weights.
+        # A common factor of the weights does not change a step. The division prevents underflow of their products.
         guided = by_residual = relative(prior, prior)
         if self.by_residual:
-            by_residual, prior = _relative_to_mean(problem.weights), problem.weights
+            prior = problem.weights
+            # Unlike the largest weight, the mean of the positive weights is differentiable.
+            mean = prior.sum(-1, keepdim=True) / (prior > 0).sum(-1, keepdim=True).clamp(min=1)
+            by_residual = prior / torch.where(mean > 0, mean, 1.0)
         poses = starts.poses
         # The memory layout of `problems_last` is (3, 3, S B) and (3, S B).
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
@@ -328,7 +330,8 @@ class RobustWeightedLM(Configured):
         step, damping = (per_problem(x, problem.img_scale) for x in (step, damping))
         seen = at_pose(now.state, problem, plan.votes)
         mixture = updated(now.mixture, seen, plan.votes, known)
-        equations = self._by_mixture(seen, problem, mixture)
+        robust = mixture.weights(seen) / mixture.variance
+        equations = self._equations(seen.projection, problem, robust, seen.precision)
         state, solved = lm_step(equations, now.state, seen.projection.focal, step, damping, additive=self.additive)
         return Progress(state, solved, now.factor, mixture)
 
@@ -383,8 +386,7 @@ class RobustWeightedLM(Configured):
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
-        # At a minimum, both costs differ only by rounding errors. The step is then accepted, because a rejected step
-        # has no gradient.
+        # At a minimum, both costs differ by rounding errors. The step is accepted: a rejected step has no gradient.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
@@ -399,10 +401,6 @@ class RobustWeightedLM(Configured):
         if problem.noise is None and problem.terms:  # without noise, sigma is one pixel of the caller
             robust = robust / problem.img_scale.square()[:, None]
         return projection, self._equations(projection, problem, robust, precision)
-
-    def _by_mixture(self, seen: AtPose, problem: Problem, mixture: Mixture) -> NormalEquations:
-        """The normal equations with the weights of the mixture."""
-        return self._equations(seen.projection, problem, mixture.weights(seen) / mixture.variance, seen.precision)
 
     def _equations(
         self, projection: Projection, problem: Problem, robust: Tensor, precision: Tensor | Symmetric2
@@ -450,7 +448,9 @@ class RobustWeightedLM(Configured):
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
             if mixture is None:
                 return self._by_kernel(at, problem, shape)[1]
-            return self._by_mixture(at_pose(at, problem, plan.votes), problem, mixture)
+            seen = at_pose(at, problem, plan.votes)
+            robust = mixture.weights(seen) / mixture.variance
+            return self._equations(seen.projection, problem, robust, seen.precision)
 
         mixture, state = now.mixture, now.state
         problem = plan.problem._replace(weights=plan.guided if mixture is None else plan.by_residual)
@@ -491,9 +491,3 @@ def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
         return None
     noise = map_tensors(lambda x: x.nan_to_num(0.0), given) if starts.noise is None else starts.noise
     return noise._replace(img_cov=given.img_cov, world_cov=given.world_cov).bounded(problem.focal)
-
-
-def _relative_to_mean(weights: Tensor) -> Tensor:
-    """Divide weights by the mean of the positive weights. Unlike the largest weight, the mean is differentiable."""
-    mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
-    return weights / torch.where(mean > 0, mean, 1.0)
