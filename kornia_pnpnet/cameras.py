@@ -215,13 +215,9 @@ def looking_along(inputs: Inputs) -> Inputs:
 
 
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (*, 3, 3) to a last entry of 1, and tell which are valid, bool (*).
-
-    Invalid matrices become the identity, without gradient. See :func:`scaled_cameras`.
-    """
+    """Scale camera matrices (*, 3, 3) as :func:`~kornia_pnpnet.frame.scaled_cameras` does, and tell which are valid."""
     entries, sound = scaled_cameras(intrinsics.flatten(-2).movedim(-1, 0))
-    eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
-    return torch.where(sound[..., None, None], entries.movedim(0, -1).unflatten(-1, (3, 3)), eye), sound
+    return entries.movedim(0, -1).unflatten(-1, (3, 3)), sound
 
 
 def focal_length(camera: Tensor) -> Tensor:

@@ -266,9 +266,7 @@ class Normalize(Configured):
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales
         img_scale = (horizontal * vertical).abs().sqrt()  # (1 or N, B)
-        eye = torch.eye(3, dtype=camera.dtype, device=camera.device).view(9, *(1,) * (cameras.ndim - 1))
-        matrices = torch.where(is_camera, cameras, eye)
-        matrices = (matrices.mT if intrinsics.ndim == 3 else matrices.permute(2, 1, 0)).unflatten(-1, (3, 3))
+        matrices = (cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)).unflatten(-1, (3, 3))
         mean_scale = img_scale[0]
         if rig is not None:  # a problem without pairs gets the scale 1
             share = there.to(rows.dtype) / number.clamp(min=1)
@@ -303,7 +301,7 @@ class Normalize(Configured):
 
 
 def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Invalid ones become all ones.
+    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Others become the identity.
 
     A valid matrix has zeros below its diagonal and focal lengths that are not 0. The fourth powers of its entries and
     of the inverses of its focal lengths and of its last entry are finite.
@@ -315,7 +313,8 @@ def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
     largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].reciprocal())).abs().sum(0)
     below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
     fine = (largest < limit) & ~below_diagonal
-    camera = torch.where(fine, camera, 1.0)
+    eye = torch.eye(3, dtype=camera.dtype, device=camera.device)
+    camera = torch.where(fine, camera, eye.view(9, *(1,) * (camera.ndim - 1)))
     return camera / camera[8:], fine
 
 

@@ -30,7 +30,7 @@ __all__ = ["monte_carlo_pose_loss"]
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Radians. Upper limit of a t distribution's rotation scale. Tangent vectors approximate larger rotations badly.
+# Radians. Largest scale of a t distribution's rotation. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
@@ -59,19 +59,18 @@ def monte_carlo_pose_loss(
 ) -> Tensor:
     r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
 
-    The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted
-    sum of the robust losses of the residuals in standard deviations. If the world points have noise, the variance
-    depends on the pose, and the cost includes its logarithm. :math:`Z` is an integral over all poses, estimated by
-    importance sampling. Early in a training no pose fits the correspondences, and distances between poses have no
-    useful gradients. The likelihood compares the true pose with all others, and has one from the first step.
+    The likelihood compares the true pose with all others. It has useful gradients from the first step of a training,
+    when no pose fits the correspondences. The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`.
+    The cost :math:`c` is half the weighted sum of the robust losses of the residuals in standard deviations. If the
+    world points have noise, the cost includes the logarithm of the variance. In the prior :math:`p_0`, rotations are
+    uniform, and translations have a t distribution around the true translation, whose scale is half the distance
+    between camera and points. :math:`Z` is an integral over all poses, estimated by importance sampling.
 
     The same number of samples is drawn from each component of a mixture: the prior, a t distribution around the true
-    pose, one around each hypothesis, and ``rounds`` further ones, each around the mode to which the sample with the
-    largest importance weight so far is refined. The precision of a t distribution is the matrix of the normal equations
-    at its centre. In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the
-    true translation, whose scale is half the distance between camera and points.
-
-    Gradients flow to all inputs but poses. A problem that a solver would refuse has the loss 0 without gradient.
+    pose, one around each hypothesis, and ``rounds`` further ones. The centre of a further one is a mode: the refined
+    sample with the largest importance weight so far. The precision of a t distribution is the matrix of the normal
+    equations at its centre. Gradients flow to all inputs but poses. A problem that a solver would refuse has the loss 0
+    without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
     4 to 7; here with hypotheses and a prior, and with modes in place of fitted proposals.

@@ -4,9 +4,9 @@ The pose maps points by ``x_cam = R x_world + t``. The camera looks along +z. Pi
 focal length and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its
 distance. The test does not depend on the unit of the world.
 
-The dimensions of arrays in this module are coordinates, pairs and problems, in this order, so that operations run over
-long rows of memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection
-(``tests/test_kornia_contract.py``), but take three times as long for 1000 problems of 9 pairs.
+Dimensions of arrays are coordinates, pairs and problems, in this order, so that operations run over long rows of
+memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection, but take three times as long
+for 1000 problems of 9 pairs.
 """
 
 from __future__ import annotations
@@ -231,8 +231,8 @@ def normal_equations(
     Args:
         projection: the problem projected at the state.
         problem: the problem.
-        weights: weight of each pair, :math:`(B, N)`, or 2x2 weight matrix of each pair with entries :math:`(B, N)`, in
-            inverse square pixels. Points behind the camera do not count.
+        weights: weight of each pair, :math:`(B, N)`, or its weight matrix, entries :math:`(B, N)`, in inverse square
+            pixels. Points behind the camera do not count.
         relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
             underflow. The divisor has no gradient.
     """
