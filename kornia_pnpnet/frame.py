@@ -273,13 +273,12 @@ class Normalize(Configured):
             mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
         frame = Frame(centroid.mT, size, mean_scale, order, status, matrices, ignored)
         if noise is not None:
-            # Unknown (NaN) and impossible sigmas are replaced first, so that the gradient of the scale is not NaN.
-            known = [has_noise[:, None] & ~sigma.isnan() for sigma in noise[:2]]
-            units = img_scale.mT.reciprocal(), size[:, None]
-            scaled = [
-                torch.where(is_known, torch.where(is_known, sigma, 0.0) / unit, torch.nan)
-                for is_known, sigma, unit in zip(known, noise[:2], units, strict=True)
-            ]
+
+            def scaled(sigma: Tensor, unit: Tensor) -> Tensor:
+                """Replace unknown and impossible sigmas first, so that the gradient of the unit is not NaN."""
+                known = has_noise[:, None] & ~sigma.isnan()
+                return torch.where(known, torch.where(known, sigma, 0.0) / unit, torch.nan)
+
             sound = (there & has_noise).mT
             img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), noise[2:])
             if img_cov is not None:  # the matrix [[a, b], [0, d]] multiplies pixels
@@ -287,7 +286,8 @@ class Normalize(Configured):
                 img_cov = img_cov.mapped(a, b, d).at_least((LEAST_NOISE * self.f_const) ** 2)
             if world_cov is not None:
                 world_cov = world_cov.divided(size[:, None])
-            noise = Noise(scaled[0], scaled[1], img_cov, world_cov)
+            sigmas = scaled(noise.img, img_scale.mT.reciprocal()), scaled(noise.world, size[:, None])
+            noise = Noise(*sigmas, img_cov, world_cov)
         if rig is not None:
             rig = Pose(rig.rotation, rig.translation / size[:, None, None])
         if order is not None:

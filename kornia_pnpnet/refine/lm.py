@@ -249,26 +249,17 @@ class RobustWeightedLM(Configured):
                 parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
         return refine
 
-    def forward(
-        self, problem: Problem, starts: Starts, *, m: int | None = None, more: int = 0, run: Runner = EAGER
-    ) -> Refinement:
-        """Refine the poses of ``starts``.
+    def forward(self, problem: Problem, starts: Starts) -> Refinement:
+        """Refine the poses of ``starts`` in the frame of the problem.
 
         A pose is ``ok`` only if the equations of the last iteration could be solved, three pairs are in front of the
         camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.evidence.believe`).
-
-        Args:
-            problem: the problems.
-            starts: initial poses in the frame of the problem, and a weight factor for each pair.
-            m: number of iterations to run; ``None``: all iterations.
-            more: number of additional iterations with the hyperparameters of the last iteration.
-            run: calls each part of the refinement, compiled or uncompiled.
         """
-        plan, now = self.iterate(run(self.begin, problem, starts), m, more=more, run=run)
-        return run(self.judge, plan, now)
+        plan, now = self.iterate(self.begin(problem, starts))
+        return self.judge(plan, now)
 
     def begin(self, problem: Problem, starts: Starts) -> Plan:
-        """Run everything before the first iteration. See :meth:`forward` for the arguments."""
+        """Run everything before the first iteration."""
         each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
         given = problem.noise
         known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
@@ -296,7 +287,14 @@ class RobustWeightedLM(Configured):
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[Plan, Progress]:
         """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
 
-        Returns the plan with the noise of the iterations by residual, and the last states. See :meth:`forward`.
+        Args:
+            plan: the result of :meth:`begin`.
+            m: number of iterations to run; ``None``: all iterations.
+            more: number of additional iterations with the hyperparameters of the last iteration.
+            run: calls each part of the refinement, compiled or uncompiled.
+
+        Returns:
+            The plan with the noise of the iterations by residual, and the last states.
         """
         m = self.m if m is None else min(m, self.m)
         each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
