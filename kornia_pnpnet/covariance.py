@@ -17,7 +17,7 @@ from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Noise, State
 from kornia_pnpnet.refine.residual import information, normal_equations, pixel_variance, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
-from kornia_pnpnet.result import Pose, PosePrior, gate_pose
+from kornia_pnpnet.result import Pose, PosePrior, sound_pose
 
 __all__ = ["pose_covariance", "shown_noise"]
 
@@ -111,7 +111,7 @@ def pose_covariance(
     assert inputs.init is not None
     assert problem.noise is not None
     framed_pose, posed = frame.start(inputs.init)
-    pose = gate_pose(inputs.init, posed, posed)
+    pose = sound_pose(inputs.init, posed)
     size_of_camera = 0 if focal == "known" else 1
     state = State(framed_pose, problem.weights.new_zeros(len(problem.weights), size_of_camera))
     projection = project(state, problem)

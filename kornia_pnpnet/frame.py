@@ -19,7 +19,7 @@ from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
-from kornia_pnpnet.result import Pose, Status, gate_pose, sound_pose
+from kornia_pnpnet.result import Pose, Status, sound_pose
 
 __all__ = ["F_CONST", "Frame", "Normalize", "scaled_cameras"]
 
@@ -99,7 +99,7 @@ class Frame(NamedTuple):
         limit = torch.finfo(eye.dtype).max ** 0.25  # fourth powers of numbers below this limit are finite
         values = torch.cat((init.rotation.flatten(1), init.translation / self.size[:, None]), 1)
         usable = self.valid & (values.abs().amax(-1) < limit)
-        return self.apply(gate_pose(init, usable, usable)), usable
+        return self.apply(sound_pose(init, usable)), usable
 
 
 class Normalize(Configured):
