@@ -1,8 +1,4 @@
-r"""Normalisation of problems: the transform from the caller's frame to the solver's frame, and its inverse.
-
-Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0. The world can be centred
-and scaled, so that the solved pose is equivariant to translations and scalings of the world.
-"""
+r"""Normalisation of problems: the transform from the caller's frame to the solver's frame, and its inverse."""
 
 from __future__ import annotations
 
@@ -104,6 +100,8 @@ class Frame(NamedTuple):
 
 class Normalize(Configured):
     r"""Normalise the cameras, the order of the pairs, and the world frame of problems.
+
+    Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0.
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
     with or without skew). At least three of its pairs have a positive weight, and its points do not coincide or lie on

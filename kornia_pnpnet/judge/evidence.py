@@ -1,21 +1,19 @@
 r"""The evidence for a pose: how much likelier the pairs are with this pose than without a pose.
 
-*Model.* The residual of an inlier is Gaussian. One of ten inliers has three times the standard deviation. The pixel of
-an outlier is uniformly distributed in a square that has the variance of the pixels. Let :math:`w` be the share of
-inliers, and let :math:`s` be a factor of all standard deviations. Let :math:`d_i(s)` be the density of pair :math:`i`
-as an inlier, divided by its density as an outlier. The log-likelihood ratio is
+The residual of an inlier is Gaussian. One of ten inliers has three times the standard deviation. The pixel of an
+outlier is uniformly distributed. Let :math:`w` be the share of inliers, :math:`s` a factor of all variances, and
+:math:`d_i(s)` the density of pair :math:`i` as an inlier, divided by its density as an outlier. The log-likelihood
+ratio
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
-without its three largest terms, because some pose fits any three pairs. Copies of a pair share one vote :math:`v_i`.
-Expectation and maximisation estimate the share :math:`w`. If the noise is unknown, the factors :math:`s` are a grid of
-angles, which has the same meaning for all cameras. If the caller gave the noise, the factor is 1 or, with a low prior
-probability, larger.
+leaves out its three largest terms, because some pose fits any three pairs. Copies of a pair share one vote :math:`v_i`.
+Expectation and maximisation estimate :math:`w`. If the noise is unknown, :math:`s` is a grid of angles; if the caller
+gave the noise, :math:`s` is 1 or, with a low prior probability, larger.
 
-*Evidence.* The evidence is the logarithm of the mean of :math:`\exp L(s)` over the factors, minus the logarithms of the
-number of minimal samples and of the number of poses per sample.
-
-*Belief.* A pose is to be believed if the evidence suffices and the inliers determine the pose accurately.
+The *evidence* is the logarithm of the mean of :math:`\exp L(s)`, minus the logarithms of the number of minimal samples
+and of the number of poses per sample. A pose is to be *believed* if the evidence suffices and the inliers determine the
+pose accurately.
 
 The results have no gradient.
 """
@@ -163,10 +161,7 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Relative densities (B, N) of inliers, of inliers each divided by its factor of the variance, and of outliers.
-
-        ``exponent`` and ``outlier`` are those of :class:`AtPose`.
-        """
+        """Densities (B, N) of inliers, of inliers divided by their factor of the variance, and of outliers."""
         scaled = exponent / self.variance
         narrow, wide = scaled.exp(), (scaled / _WIDE).exp()
         share = _TAIL / (1.0 - _TAIL) / _WIDE
@@ -265,9 +260,9 @@ def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
 
 @torch.no_grad()
 def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None = None) -> Mixture:
-    """One round of expectation and maximisation.
+    """One round of expectation and maximisation. Problems ``frozen``, bool (B, 1), keep their variance.
 
-    The variance of problems ``frozen``, bool (B, 1), does not change; ``None``: of those with noise from the caller.
+    ``None``: the problems with noise from the caller are frozen.
     """
     exponent = seen.exponent.detach()
     inlier, weighted, outlier = mixture.densities(exponent, seen.outlier.detach())
@@ -314,11 +309,11 @@ def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
-    """Standard deviation of the pose, in units of the largest errors of a correct pose.
+    """Standard deviation of the pose in units of the largest errors of a correct pose, float64, (B,).
 
-    The variances of the rotation and of the translation are traces of their covariances. An unknown focal length, whose
-    error changes the distance, is part of the covariance. ``precision`` is the inverse variance (or covariance) of each
-    pixel in px^-2, (B, N), 0 for outliers. The result is float64, (B,), infinite for an undetermined pose.
+    The variances of rotation, translation and an unknown focal length, which changes the distance, are added.
+    ``precision`` is the inverse variance (or covariance) of each pixel in px^-2, (B, N), 0 for outliers. The result is
+    infinite for an undetermined pose.
     """
     precision = map_tensors(lambda x: problem.focal.square() * x, precision)
     matrix = normal_equations(projection, problem, precision).matrix

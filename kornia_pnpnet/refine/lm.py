@@ -138,9 +138,9 @@ class RobustWeightedLM(Configured):
     r"""Refine poses by ``m`` unrolled iterations of robust weighted Levenberg-Marquardt.
 
     Each iteration takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. The weight of a pair is the product of the
-    caller's weight, the initialiser's weight, and the robust weight of the pair's residual at the previous estimate.
-    Step :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``)
-    are learned. A problem that cannot be solved keeps its pose, and is not ``ok``.
+    caller's weight, the initialiser's weight, and the robust weight of the residual at the previous estimate. Step
+    :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel) are learned. A problem that cannot
+    be solved keeps its pose, and is not ``ok``.
 
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
     pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is in standard deviations.
@@ -231,9 +231,7 @@ class RobustWeightedLM(Configured):
         return step, damping, shape
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
-        """Copy the module with another number of iterations.
-
-        A smaller number keeps the hyperparameters of the first iterations, a larger number repeats those of the last.
+        """Copy the module with fewer iterations, or with more, which repeat the hyperparameters of the last.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
@@ -438,9 +436,9 @@ class RobustWeightedLM(Configured):
         r"""Attach the gradient of the minimiser to a converged state, by the implicit function theorem.
 
         At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
-        The code adds a Newton step that has this gradient and the value 0, with the Gauss-Newton matrix if the Newton
-        matrix is not positive definite. A second step makes second derivatives exact. Covariances rotate with the pose,
-        so that the matrix is not exactly symmetric: a third step then removes most of the error.
+        Each added Newton step has this gradient and the value 0, with the Gauss-Newton matrix if the Newton matrix is
+        not positive definite. The second step makes second derivatives exact. With covariances the matrix is not
+        exactly symmetric, because they rotate with the pose; the third step removes most of this error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:

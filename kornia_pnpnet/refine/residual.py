@@ -397,9 +397,7 @@ def moved(state: State, delta: Tensor) -> State:
     r"""Move a state along a tangent vector :math:`(\omega, v, c)`, shape :math:`(6 + K, B)`.
 
     The pose becomes :math:`(\mathrm{cay}(\omega) R,\; t + v)`. With a centred world, a rotation leaves the centroid in
-    place, so that rotation and translation stay well separated in the normal equations at any distance of the points.
-
-    The Cayley transform
+    place, so that rotation and translation are well separated in the normal equations. The Cayley transform
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)` agrees with the
     exponential map to second order, and needs no trigonometry. Its angle is :math:`2 \arctan(|\omega|/2)`.
 
