@@ -19,18 +19,20 @@ from torch.nn.functional import normalize
 from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, check_tensors, common_dtype
 from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.problem import Noise
-from kornia_pnpnet.result import Pose
+from kornia_pnpnet.frame import scaled_cameras
+from kornia_pnpnet.problem import Inputs, Noise
+from kornia_pnpnet.result import Pose, sound_pose
 
 __all__ = [
     "bearing_cameras",
     "bearings",
     "check_coefficients",
     "focal_length",
+    "looking_along",
     "pinholes",
     "reproject",
-    "scaled_cameras",
     "undistort",
+    "with_undistorted",
 ]
 
 # Numbers of distortion coefficients that Kornia and OpenCV accept.
@@ -50,7 +52,7 @@ def undistort(
 
     Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse.
     Kornia's :func:`kornia.geometry.calibration.undistort_points` does not test convergence, and accepts pixels outside
-    the range of the polynomial. Its error is 1.4 px at 45 degrees off the axis with ``k1 = -0.2`` and ``f = 320``.
+    the range of the polynomial.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.
@@ -92,6 +94,20 @@ def undistort(
     return pixels, found, noise
 
 
+def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
+    """Replace distorted pixels by pixels of pinhole cameras, see :func:`undistort`.
+
+    Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay: ``Normalize`` refuses their problem.
+    """
+    # Rounding depends on the memory layout.
+    inputs, dist, fisheye = map_tensors(torch.Tensor.contiguous, (inputs, dist, fisheye))
+    broken = ~inputs.img_points.isfinite().all(-1)
+    seen = torch.where(broken[..., None], 0.0, inputs.img_points)
+    pixels, found, noise = undistort(seen, inputs.intrinsics, dist, fisheye, inputs.noise)
+    mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
+    return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
+
+
 @full_precision
 def bearings(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None = None, fisheye: Tensor | None = None
@@ -121,7 +137,6 @@ def bearings(
         >>> bearings(behind, camera, fisheye=torch.zeros(4))
         tensor([[[ 0.7071,  0.0000, -0.7071]]])
     """
-    check_tensors({"dist": dist, "fisheye": fisheye})
     check_coefficients(dist, fisheye)
     check_form(["*", "N", "2"], img_points=img_points)
     check_form(["*", "3", "3"], intrinsics=intrinsics)
@@ -145,16 +160,14 @@ def bearings(
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
-    """Raise when both ``dist`` and ``fisheye`` are given, or for a number of coefficients that no lens model has."""
+    """Raise unless at most one of both is a tensor, and its number of coefficients is that of a lens model."""
+    check_tensors({"dist": dist, "fisheye": fisheye})
     if dist is not None and fisheye is not None:
         raise ValueCheckError("Give dist or fisheye, not both.")
     for name, given, sizes in (("dist", dist, _COEFFICIENTS), ("fisheye", fisheye, (4,))):
         if given is not None and (given.ndim == 0 or given.shape[-1] not in sizes):
-            raise ShapeError(
-                f"{name} must have {' or '.join(map(str, sizes))} coefficients, got the shape {tuple(given.shape)}.",
-                actual_shape=tuple(given.shape),
-                expected_shape=["B", *map(str, sizes)],
-            )
+            numbers = " or ".join(map(str, sizes))
+            raise ShapeError(f"{name} must have {numbers} coefficients, got the shape {tuple(given.shape)}.")
 
 
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,31 +196,28 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     return rotation, sound[..., 0]
 
 
+def looking_along(inputs: Inputs) -> Inputs:
+    """Convert bearings to a rig: each pair has a camera whose optical axis is its bearing."""
+    inputs = map_tensors(torch.Tensor.contiguous, inputs)  # rounding depends on the memory layout
+    rotation, sound = bearing_cameras(inputs.img_points)
+    rig = inputs.rig
+    if rig is not None:  # a pair with an invalid camera becomes a pair without a direction
+        sound = sound & torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach().isfinite().all(-1)
+        turn, shift = sound_pose(rig, sound)
+        rig = Pose(rotation @ turn, (rotation @ shift[..., None])[..., 0])
+    axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
+    # The geometric mean of fx and fy converts sigmas from pixels to radians. Skew and principal point are ignored.
+    cameras, has_focal = pinholes(inputs.intrinsics.diagonal(dim1=-2, dim2=-1).diag_embed())
+    focal = torch.where(has_focal, focal_length(cameras), 0.0)
+    cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
+    rig = Pose(rotation, torch.zeros_like(rotation[..., 0])) if rig is None else rig
+    return inputs._replace(img_points=axis, intrinsics=cameras, rig=rig)
+
+
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (*, 3, 3) to a last entry of 1, and tell which are valid, bool (*).
-
-    Invalid matrices become the identity, without gradient. See :func:`scaled_cameras`.
-    """
+    """Scale camera matrices (*, 3, 3) as :func:`~kornia_pnpnet.frame.scaled_cameras` does, and tell which are valid."""
     entries, sound = scaled_cameras(intrinsics.flatten(-2).movedim(-1, 0))
-    eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
-    return torch.where(sound[..., None, None], entries.movedim(0, -1).unflatten(-1, (3, 3)), eye), sound
-
-
-def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Invalid ones become all ones.
-
-    A valid matrix has zeros below its diagonal and focal lengths that are not 0. The fourth powers of its entries and
-    of the inverses of its focal lengths and of its last entry are finite.
-    """
-    limit = torch.finfo(camera.dtype).max ** 0.25
-    entries = camera.detach()
-    scaled = entries / entries[8:]
-    # The sum of absolute values bounds each value. NaN compares false.
-    largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].reciprocal())).abs().sum(0)
-    below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
-    fine = (largest < limit) & ~below_diagonal
-    camera = torch.where(fine, camera, 1.0)
-    return camera / camera[8:], fine
+    return entries.movedim(0, -1).unflatten(-1, (3, 3)), sound
 
 
 def focal_length(camera: Tensor) -> Tensor:
@@ -272,7 +282,7 @@ def _flatten(point: Tensor) -> Tensor:
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
     """Find points (B, N, 2) that a lens maps to ``target`` (no solution: 0), and tell which targets have a solution."""
     # A Newton step is at most half as long as the target is far from the centre. Two further steps carry the gradients
-    # to the target and the coefficients; the second of these steps makes second derivatives exact.
+    # to the target and the coefficients; the second step makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)

@@ -14,11 +14,10 @@ from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, State
-from kornia_pnpnet.refine.information import pixel_precision
-from kornia_pnpnet.refine.residual import normal_equations, pixel_variance, project
+from kornia_pnpnet.problem import MIN_PAIRS, Noise, State
+from kornia_pnpnet.refine.residual import information, normal_equations, pixel_variance, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
-from kornia_pnpnet.result import Pose, PosePrior, gate_pose
+from kornia_pnpnet.result import Pose, PosePrior, sound_pose
 
 __all__ = ["pose_covariance", "shown_noise"]
 
@@ -55,9 +54,9 @@ def pose_covariance(
     :math:`\Sigma_i` is the covariance of the pixel (:func:`~kornia_pnpnet.refine.residual.pixel_covariance`). The
     computation runs in float64. Gradients flow to all arguments.
 
-    A robust kernel gives most inliers a weight below 1. An M-estimate is nevertheless almost as accurate as least
-    squares on the inliers (P. Huber, "Robust Statistics", 1981). Let :math:`u_i` be the weight of pair :math:`i`. The
-    mean weight of an inlier is :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and :math:`w_i = \min(1, u_i / \bar u)`.
+    A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
+    least squares on the inliers (P. Huber, "Robust Statistics", 1981). The mean weight of an inlier is therefore
+    :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and :math:`w_i = \min(1, u_i / \bar u)`.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -112,15 +111,17 @@ def pose_covariance(
     assert inputs.init is not None
     assert problem.noise is not None
     framed_pose, posed = frame.start(inputs.init)
-    pose = gate_pose(inputs.init, posed, posed)
+    pose = sound_pose(inputs.init, posed)
     size_of_camera = 0 if focal == "known" else 1
     state = State(framed_pose, problem.weights.new_zeros(len(problem.weights), size_of_camera))
-    projection, inlier = project(state, problem), _inlier_probability(problem.weights)
-    noise = problem.noise
-    known = ((noise.img + noise.world).isfinite() | (problem.weights == 0)).all(1)
-    least = noise.img.nan_to_num(1.0).maximum(LEAST_NOISE * problem.focal)
-    noise = noise._replace(img=least, world=noise.world.nan_to_num(0.0))
-    precision = map_tensors(lambda x: inlier * x, pixel_precision(projection, problem, noise))
+    projection = project(state, problem)
+    total = problem.weights.sum(-1, keepdim=True)
+    mean = problem.weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
+    inlier = (problem.weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)
+    known = ((problem.noise.img + problem.noise.world).isfinite() | (problem.weights == 0)).all(1)
+    noise = map_tensors(lambda x: x.nan_to_num(0.0), problem.noise).bounded(problem.focal)
+    precision = information(projection, problem._replace(noise=noise))[1]
+    precision = map_tensors(lambda x: inlier * x, precision)
     equations, determined = normal_equations(projection, problem, precision), posed & known
     if size_of_camera:
         plane, pixels = projection.plane, problem.img_points.permute(2, 1, 0) / problem.focal
@@ -135,18 +136,18 @@ def pose_covariance(
     if inputs.prior is not None:
         framed, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
         equations, determined = add_term(equations, framed.linearise(state), problem.focal), determined & usable
-    information = equations.matrix.permute(2, 0, 1) * problem.focal.square()
-    eye = torch.eye(information.shape[-1], dtype=information.dtype, device=information.device)
+    matrix = equations.matrix.permute(2, 0, 1) * problem.focal.square()
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     with torch.no_grad():
-        unit = information.diagonal(dim1=1, dim2=2).rsqrt()
-        correlation = unit[:, :, None] * information * unit[:, None]
+        unit = matrix.diagonal(dim1=1, dim2=2).rsqrt()
+        correlation = unit[:, :, None] * matrix * unit[:, None]
         is_definite = torch.linalg.cholesky_ex(correlation - _LEAST_EIGENVALUE * eye).info == 0
         determined = (determined & is_definite & correlation.isfinite().all((1, 2)))[:, None, None]
-    inverse = torch.linalg.inv_ex(torch.where(determined, information, eye)).inverse
+    inverse = torch.linalg.inv_ex(torch.where(determined, matrix, eye)).inverse
 
     # Back to the caller's world: omega does not change, v = size v_framed + (R centroid) x omega.
     rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
-    back = eye.repeat(len(information), 1, 1)
+    back = eye.repeat(len(matrix), 1, 1)
     back[:, 3:6, :3] = So3.hat(rotated_centroid)
     back[:, 3:6, 3:6] *= frame.size[:, None, None]
     if size_of_camera:  # the depth of the centroid grows with the focal length, see `refine.residual.moved`
@@ -165,15 +166,7 @@ def shown_noise(
     The noise of a point moves its pixel by an amount that falls with the depth. The likeliest of five ratios between
     the noise of the points and the noise of the pixels is chosen, for residuals with a normal distribution.
 
-    Args:
-        pose: See pose_covariance.
-        world_points: See pose_covariance.
-        img_points: See pose_covariance.
-        intrinsics: See pose_covariance.
-        weights: See pose_covariance.
-
-    Returns:
-        ``img_sigma`` and ``world_sigma`` of :func:`pose_covariance`, shape :math:`(B,)` each.
+    For the arguments see :func:`pose_covariance`. Returns its ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
     """
     size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose")
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
@@ -192,10 +185,3 @@ def shown_noise(
     share, scale = share[best, 0], scale.gather(0, best[None])[0]
     img, world = (share * scale).sqrt() / problem.img_scale, ((1.0 - share) * scale / mean).sqrt() * frame.size
     return {"img_sigma": restore_leading(size, img.to(dtype)), "world_sigma": restore_leading(size, world.to(dtype))}
-
-
-def _inlier_probability(weights: Tensor) -> Tensor:
-    """The factors :math:`w` in :func:`pose_covariance`, (B, N)."""
-    total = weights.sum(-1, keepdim=True)
-    mean = weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
-    return (weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)

@@ -1,18 +1,12 @@
-r"""Normalisation of problems: the transform from the caller's frame to the solver's frame, and its inverse.
-
-Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0. The world can be centred
-and scaled, so that the solved pose is equivariant to translations and scalings of the world.
-"""
+r"""Normalisation of problems: the transform from the caller's frame to the solver's frame, and its inverse."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.cameras import scaled_cameras
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import span_a_plane
@@ -21,16 +15,16 @@ from kornia_pnpnet.core.symmetric import are_semi_definite
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
-from kornia_pnpnet.result import Pose, Status, gate_pose
+from kornia_pnpnet.result import Pose, Status, sound_pose
 
-__all__ = ["F_CONST", "Frame", "Normalize"]
+__all__ = ["F_CONST", "Frame", "Normalize", "scaled_cameras"]
 
 #: Pixels. Focal length of the normalised camera (cameras of ETH3D have focal lengths of 3400 to 3430).
 F_CONST = 3400.0
 # Limit of the entries of given poses. Their fourth powers must be finite in float32, the dtype of the networks.
 _LARGEST_ENTRY = torch.finfo(torch.float32).max ** 0.25
-# Typical distances (see `Normalize`) from the median of the points. Centre and scale ignore points beyond `_FAR`. With
-# fewer than `_MANY` pairs the limit is `_FAR_OF_FEW`, because the typical distance of few points is inaccurate.
+# Typical distances (see `Normalize`) from the median. Centre and scale ignore points beyond `_FAR`, or `_FAR_OF_FEW`
+# with fewer than `_MANY` pairs, because the typical distance of few points is inaccurate.
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
 # Typical distances from the median. Points further away lose their weight, because float32 has too few digits.
 _LARGEST_DISTANCE = 1e6
@@ -102,11 +96,13 @@ class Frame(NamedTuple):
         init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
         values = torch.cat((init.rotation.flatten(1), self.apply(init).translation), 1).detach()
         usable = self.valid & (values.abs().amax(-1) < _LARGEST_ENTRY)
-        return self.apply(gate_pose(init, usable, usable)), usable
+        return self.apply(sound_pose(init, usable)), usable
 
 
 class Normalize(Configured):
     r"""Normalise the cameras, the order of the pairs, and the world frame of problems.
+
+    Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0.
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
     with or without skew). At least three of its pairs have a positive weight, and its points do not coincide or lie on
@@ -116,8 +112,8 @@ class Normalize(Configured):
     Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
     the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
     five typical distances from the median of the points (25 with fewer than 12 pairs). The typical distance is the
-    radius around the median that contains two thirds of the points. A pair loses its weight when its point is more than
-    a million typical distances from the median, or when its pixel is almost 90° off the axis.
+    radius around the median that contains two thirds of the points. A pair loses its weight if its point is more than a
+    million typical distances from the median, or its pixel almost 90° off the axis.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -244,9 +240,7 @@ class Normalize(Configured):
             values = torch.cat((rig.rotation.flatten(-2), rig.translation / size[:, None, None]), -1).detach()
             sound = (values.abs() < _LARGEST_ENTRY).all(-1)  # (B, N)
             is_finite = is_finite & (sound | ~given.mT).all(-1)
-            eye = torch.eye(3, dtype=rows.dtype, device=rows.device)
-            rotation = torch.where(sound[..., None, None], rig.rotation, eye)
-            rig = Pose(rotation, torch.where(sound[..., None], rig.translation, 0.0))
+            rig = sound_pose(rig, sound)
         status = torch.where(spread_out, Status.PRECISION.value, Status.DEGENERATE.value)
         status = status.masked_fill(is_precise, Status.SOLVED.value)
         status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # no camera, or not the pixels' camera
@@ -271,26 +265,28 @@ class Normalize(Configured):
         world_points, img_points, weights = rows.permute(2, 1, 0).split((3, 2, 1), -1)
         horizontal, vertical = img_scales
         img_scale = (horizontal * vertical).abs().sqrt()  # (1 or N, B)
-        eye = torch.eye(3, dtype=camera.dtype, device=camera.device).view(9, *(1,) * (cameras.ndim - 1))
-        matrices = torch.where(is_camera, cameras, eye)
-        matrices = (matrices.mT if intrinsics.ndim == 3 else matrices.permute(2, 1, 0)).unflatten(-1, (3, 3))
+        matrices = (cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)).unflatten(-1, (3, 3))
         mean_scale = img_scale[0]
         if rig is not None:  # a problem without pairs gets the scale 1
             share = there.to(rows.dtype) / number.clamp(min=1)
             mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
         frame = Frame(centroid.mT, size, mean_scale, order, status, matrices, ignored)
         if noise is not None:
-            # Unknown (NaN) and impossible sigmas are replaced first, so that the gradient of the scale is not NaN.
-            known = [has_noise[:, None] & ~sigma.isnan() for sigma in noise[:2]]
-            units = img_scale.mT.reciprocal(), size[:, None]
-            scaled = [
-                torch.where(is_known, torch.where(is_known, sigma, 0.0) / unit, torch.nan)
-                for is_known, sigma, unit in zip(known, noise[:2], units, strict=True)
-            ]
-            noise = noise._replace(img=scaled[0], world=scaled[1])
-            if noise.covariances:
-                pixel_map = [x.mT for x in (img_scales[0], -camera[1] / camera[0] * img_scales[1], img_scales[1])]
-                noise = self._scaled_covariances(noise, (there & has_noise).mT, pixel_map, size)
+
+            def scaled(sigma: Tensor, unit: Tensor) -> Tensor:
+                """Replace unknown and impossible sigmas first, so that the gradient of the unit is not NaN."""
+                known = has_noise[:, None] & ~sigma.isnan()
+                return torch.where(known, torch.where(known, sigma, 0.0) / unit, torch.nan)
+
+            sound = (there & has_noise).mT
+            img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), noise[2:])
+            if img_cov is not None:  # the matrix [[a, b], [0, d]] multiplies pixels
+                a, b, d = (x.mT for x in (horizontal, -camera[1] / camera[0] * vertical, vertical))
+                img_cov = img_cov.mapped(a, b, d).at_least((LEAST_NOISE * self.f_const) ** 2)
+            if world_cov is not None:
+                world_cov = world_cov.divided(size[:, None])
+            sigmas = scaled(noise.img, img_scale.mT.reciprocal()), scaled(noise.world, size[:, None])
+            noise = Noise(*sigmas, img_cov, world_cov)
         if rig is not None:
             rig = Pose(rig.rotation, rig.translation / size[:, None, None])
         if order is not None:
@@ -302,15 +298,23 @@ class Normalize(Configured):
         scales = mean_scale, size.reciprocal(), is_usual.mT
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 
-    def _scaled_covariances(self, noise: Noise, sound: Tensor, pixel_map: Sequence[Tensor], size: Tensor) -> Noise:
-        """Convert covariances to the units of the problem. Covariances of pairs that are not ``sound`` are ignored."""
-        # `pixel_map` holds the entries a, b, d of the matrix [[a, b], [0, d]] that multiplies pixels.
-        img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), (noise.img_cov, noise.world_cov))
-        if img_cov is not None:
-            img_cov = img_cov.mapped(*pixel_map).at_least((LEAST_NOISE * self.f_const) ** 2)
-        if world_cov is not None:
-            world_cov = world_cov.divided(size[:, None])
-        return noise._replace(img_cov=img_cov, world_cov=world_cov)
+
+def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
+    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Others become the identity.
+
+    A valid matrix has zeros below its diagonal and focal lengths that are not 0. The fourth powers of its entries and
+    of the inverses of its focal lengths and of its last entry are finite.
+    """
+    limit = torch.finfo(camera.dtype).max ** 0.25
+    entries = camera.detach()
+    scaled = entries / entries[8:]
+    # The sum of absolute values bounds each value. NaN compares false.
+    largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].reciprocal())).abs().sum(0)
+    below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
+    fine = (largest < limit) & ~below_diagonal
+    eye = torch.eye(3, dtype=camera.dtype, device=camera.device)
+    camera = torch.where(fine, camera, eye.view(9, *(1,) * (camera.ndim - 1)))
+    return camera / camera[8:], fine
 
 
 def _is_usable(noise: Noise, given: Tensor, size: Tensor) -> Tensor:

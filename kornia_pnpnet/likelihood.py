@@ -11,7 +11,6 @@ from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
-from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from kornia_pnpnet.arguments import checked_inputs
@@ -19,11 +18,10 @@ from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.problem import LEAST_NOISE, Problem, Starts, State
-from kornia_pnpnet.refine.information import information
+from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import RobustWeightedLM
-from kornia_pnpnet.refine.residual import covariance_at, normal_equations, project, retract
+from kornia_pnpnet.refine.residual import covariance_at, information, normal_equations, project, retract, tangent
 from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
@@ -32,7 +30,7 @@ __all__ = ["monte_carlo_pose_loss"]
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Radians. Upper limit of a t distribution's rotation scale. Tangent vectors approximate larger rotations badly.
+# Radians. Largest scale of a t distribution's rotation. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
@@ -61,19 +59,18 @@ def monte_carlo_pose_loss(
 ) -> Tensor:
     r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
 
-    The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted
-    sum of the robust losses of the residuals in standard deviations. If the world points have noise, the variance
-    depends on the pose, and the cost includes its logarithm. :math:`Z` is an integral over all poses, estimated by
-    importance sampling. Early in a training no pose fits the correspondences, and distances between poses have no
-    useful gradients. The likelihood compares the true pose with all others, and has one from the first step.
+    The likelihood compares the true pose with all others. It has useful gradients from the first step of a training,
+    when no pose fits the correspondences. The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`.
+    The cost :math:`c` is half the weighted sum of the robust losses of the residuals in standard deviations. If the
+    world points have noise, the cost includes the logarithm of the variance. In the prior :math:`p_0`, rotations are
+    uniform, and translations have a t distribution around the true translation, whose scale is half the distance
+    between camera and points. :math:`Z` is an integral over all poses, estimated by importance sampling.
 
     The same number of samples is drawn from each component of a mixture: the prior, a t distribution around the true
-    pose, one around each hypothesis, and ``rounds`` further ones, each around the mode to which the sample with the
-    largest importance weight so far is refined. The precision of a t distribution is the matrix of the normal equations
-    at its centre. In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the
-    true translation, whose scale is half the distance between camera and points.
-
-    Gradients flow to all inputs but poses. A problem that a solver would refuse has the loss 0 without gradient.
+    pose, one around each hypothesis, and ``rounds`` further ones. The centre of a further one is a mode: the refined
+    sample with the largest importance weight so far. The precision of a t distribution is the matrix of the normal
+    equations at its centre. Gradients flow to all inputs but poses. A problem that a solver would refuse has the loss 0
+    without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
     4 to 7; here with hypotheses and a prior, and with modes in place of fitted proposals.
@@ -149,8 +146,7 @@ def monte_carlo_pose_loss(
     points = (inputs.world_points - frame.centroid[:, None]) / unit[..., None]
     problem, _ = Normalize(center=False, scale=False, order=False)(points, *inputs[1:5], noise)
     assert problem.noise is not None
-    least = problem.noise.img.maximum(LEAST_NOISE * problem.focal)  # as in solvers
-    problem = problem._replace(noise=problem.noise._replace(img=least))
+    problem = problem._replace(noise=problem.noise.bounded(problem.focal))
 
     axis = points.new_tensor([0.0, 0.0, 1.0])  # a refused problem gets a constant translation
     poses = [Pose(pose.rotation, torch.where(live[:, None], pose.translation, axis)) for pose, _ in started]
@@ -211,12 +207,9 @@ class _Component(NamedTuple):
 
     def log_density(self, poses: Pose) -> Tensor:
         """Logarithm of the density per radian³ and unit³, (S, B)."""
-        turn = poses.rotation @ self.pose.rotation.mT
-        # The inverse of Cayley's map. The clamp avoids a division by 0 at a half turn.
-        cosine = 1.0 + turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-        omega = 2.0 * So3.vee(turn - turn.mT) / cosine.clamp(min=1e-4)
-        tangent = torch.cat((omega, poses.translation - self.pose.translation), -1)
-        sq_distance = (tangent[..., None, :] @ self.factor)[..., 0, :].square().sum(-1)
+        omega = tangent(poses.rotation @ self.pose.rotation.mT)
+        vector = torch.cat((omega, poses.translation - self.pose.translation), -1)
+        sq_distance = (vector[..., None, :] @ self.factor)[..., 0, :].square().sum(-1)
         log_determinant = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         # Cayley's map from tangent vectors to rotations multiplies volumes by 1 / (1 + |omega|² / 4)².
         return _log_t(sq_distance, 6) + log_determinant + 2.0 * torch.log1p(0.25 * omega.square().sum(-1))
@@ -264,11 +257,9 @@ class _Posterior(NamedTuple):
         factor = problem.focal.square() * problem.weights * self.refine.kernel.weight(sq_residual, self.shape)
         weights = map_tensors(lambda x: factor * x, precision)
         matrix = normal_equations(projection, problem, weights).matrix.permute(2, 0, 1)
-        widest = (
-            torch.full_like(pose.translation, _WIDEST_ROTATION),
-            (_PRIOR_TRANSLATION * self.prior.distance).expand(-1, 3),
-        )
-        matrix = matrix + torch.diag_embed(torch.cat(widest, -1).square().reciprocal())
+        widest = torch.full_like(pose.translation, _WIDEST_ROTATION)
+        widest = torch.cat((widest, (_PRIOR_TRANSLATION * self.prior.distance).expand(-1, 3)), -1)
+        matrix = matrix + torch.diag_embed(widest.square().reciprocal())
         # The matrix is scaled to a unit diagonal, so that rounding does not depend on units.
         scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
         eye = torch.eye(6, dtype=scale.dtype, device=scale.device)

@@ -91,16 +91,15 @@ class PoseLoss(nn.Module):
 
     The refined translation is compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`, and
     that of the first guess at the centroid of the points, because at a far origin it would repeat the rotation error.
-
     The error of a failed refinement has no bound. The weighted refined distance :math:`d` of a problem is therefore
-    saturated to :math:`d / (1 + d / c)`. For the largest :math:`d` of a success as :math:`c`, this counts failures.
+    saturated to :math:`d / (1 + d / c)`.
 
     Args:
         rotation: weight of the chordal rotation distances.
         translation: weight of the refined translation distance, per unit of length.
         init_translation: weight of the first guess's translation distance, per unit of length.
         refined: weight of the refined terms for ``ramp=1``. The terms of the first guess have the weight 1.
-        saturation: :math:`c`; ``None``: no saturation.
+        saturation: :math:`c`, such as the largest distance of a success; ``None``: no saturation.
 
     Raises:
         BaseError: for a negative weight, or a saturation that is not positive.

@@ -22,7 +22,7 @@ from kornia_pnpnet.core.checks import (
     expand_sigma,
 )
 from kornia_pnpnet.core.performance import full_precision
-from kornia_pnpnet.result import Pose, camera_matrices, check_pose, with_rotation
+from kornia_pnpnet.result import Pose, camera_matrices, check_pose, sound_pose, with_rotation
 
 __all__ = ["depth_points", "heatmap_keypoints"]
 
@@ -38,8 +38,7 @@ def heatmap_keypoints(
 
     The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance is
     that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), and thus positive
-    definite even if all probability is in one cell. Through a loss such as
-    :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`, it can learn to be the covariance of the keypoint's error.
+    definite. A loss such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` trains it.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
@@ -125,8 +124,8 @@ def depth_points(
     Returns:
         A solver's ``world_points``, shape :math:`(B, N, 3)`, and its ``world_cov`` in squared units of the world, shape
         :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its sigma is negative, a
-        number is not finite or so large that its fourth power overflows, or its camera or pose is invalid. The solver's
-        ``mask`` must exclude such a pair, else its problem is not ``ok``.
+        number is not finite or so large that its fourth power overflows, or its camera or pose is invalid. Exclude
+        such a pair by the solver's ``mask``, else its problem is not ``ok``.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma
@@ -169,8 +168,7 @@ def depth_points(
     eye = torch.eye(3, dtype=dtype, device=pixels.device)
     camera, has_camera = pinholes(camera)
     posed = has_camera & (torch.cat((rotation.flatten(-2), translation), -1).detach().abs() < limit).all(-1)
-    rotation = torch.where(posed[..., None, None], rotation, eye)
-    translation = torch.where(posed[..., None], translation, 0.0)
+    rotation, translation = sound_pose(Pose(rotation, translation), posed)
     numbers = [pixels, *(x[..., None] for x in (depth, sigma_depth, sigma_img))]
     numbers += [] if img_cov is None else [img_cov.to(dtype).flatten(-2)]
     sound = posed[..., None] & (torch.cat(numbers, -1).detach().abs() < limit).all(-1)

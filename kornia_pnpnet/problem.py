@@ -14,9 +14,9 @@ from torch import Tensor
 
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.result import Pose
+from kornia_pnpnet.result import Pose, PosePrior
 
-__all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
+__all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Inputs", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
 
 #: Focal lengths. Least standard deviation of a pixel, so that the weights of exact pixels are finite.
 LEAST_NOISE = 1e-6
@@ -57,7 +57,7 @@ class Noise(NamedTuple):
 
     Attributes:
         img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``,
-            ``img`` is the sigma of isotropic noise with the trace of ``img_cov``. Networks ignore ``img_cov``.
+            the sigma of isotropic noise with the same trace, for networks, which ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, each entry of shape :math:`(B, N)`. ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.
@@ -68,6 +68,10 @@ class Noise(NamedTuple):
     img_cov: Symmetric2 | None = None
     world_cov: Symmetric3 | None = None
 
+    def bounded(self, focal: Tensor) -> Noise:
+        """Raise the sigma of each pixel to at least :data:`LEAST_NOISE` times the focal length."""
+        return self._replace(img=self.img.maximum(LEAST_NOISE * focal))
+
     @property
     def sigmas(self) -> Noise:
         """The noise without covariances."""
@@ -77,6 +81,31 @@ class Noise(NamedTuple):
     def covariances(self) -> list[Symmetric2 | Symmetric3]:
         """The covariances that are not ``None``."""
         return [x for x in (self.img_cov, self.world_cov) if x is not None]
+
+
+class Inputs(NamedTuple):
+    """The arguments of :meth:`~kornia_pnpnet.solver.PnPNet.forward` as one batch in one dtype.
+
+    Attributes:
+        intrinsics: in a rig, a camera matrix for each pair, :math:`(B, N, 3, 3)`.
+        noise: if given, every pair has sigmas, NaN where unknown.
+        rig: the transform from the rig to the camera of each pair.
+        free_focal: range and prior of an unknown focal length in the caller's pixels, see :class:`Problem`.
+        radial: estimated coefficients of radial distortion, which has been removed from the pixels.
+    """
+
+    world_points: Tensor
+    img_points: Tensor
+    intrinsics: Tensor
+    weights: Tensor | None = None
+    mask: Tensor | None = None
+    init: Pose | None = None
+    noise: Noise | None = None
+    confidence: Tensor | None = None
+    prior: PosePrior | None = None
+    rig: Pose | None = None
+    free_focal: Any = None
+    radial: Tensor | None = None
 
 
 class Linear(NamedTuple):
@@ -121,12 +150,11 @@ class Problem(NamedTuple):
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
         usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), else 0, shape :math:`(B, N)`.
-        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown; or ``None``.
-        confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`; or
-            ``None``.
+        noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown.
+        confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`.
         rig: the transform from the rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose
             of the problem is then the pose of the rig. ``None``: one camera.
-        prior: prior of the pose, a :class:`~kornia_pnpnet.refine.terms.PoseTerm`; or ``None``.
+        prior: prior of the pose, a :class:`~kornia_pnpnet.refine.terms.PoseTerm`.
         free_focal: range and prior of an unknown focal length, a :class:`~kornia_pnpnet.refine.terms.CameraTerm`;
             ``None``: the focal length is ``focal``.
     """
@@ -177,10 +205,8 @@ class Problem(NamedTuple):
         return (self.rig.rotation * rays[..., None]).sum(-2)
 
     def seen_with(self, zoom: Tensor) -> Problem:
-        """The same pairs with the known focal length ``focal * exp(zoom)``. ``zoom`` has the shape (B, 1) or (B, 0).
-
-        Pixels and their noise are divided by the exponential of ``zoom``, because all problems share ``focal``.
-        """
+        """The same pairs with the known focal length ``focal * exp(zoom)``. ``zoom`` has the shape (B, 1) or (B, 0)."""
+        # All problems share `focal`: pixels and their noise are divided by the exponential.
         if not zoom.shape[1]:
             return self
         factor = (-zoom).exp()
@@ -204,9 +230,8 @@ class Starts(NamedTuple):
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
         ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: all true.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
-        noise: noise of each pair in the units of the problem, without covariances. The initialiser's estimate replaces
-            unknown noise of the caller. With ``noise``, residuals are measured in standard deviations. ``None``: the
-            initialiser does not estimate noise.
+        noise: noise of each pair in the units of the problem, without covariances: the caller's, where unknown the
+            initialiser's estimate. ``None``: the initialiser does not estimate noise.
         camera: initial camera parameters for all poses, see :class:`State`; ``None``: zeros.
     """
 
@@ -235,7 +260,7 @@ class Hypotheses(NamedTuple):
 
     Attributes:
         pose: rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)` in the frame of the sample.
-        valid: which slots hold a solution, bool, shape :math:`(B, S)`. Values in the other slots are finite.
+        valid: which slots hold a solution, bool, shape :math:`(B, S)`. Other slots have finite values.
     """
 
     pose: Pose

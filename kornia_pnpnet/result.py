@@ -26,6 +26,7 @@ from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import (
+    Shapes,
     check_devices,
     check_form,
     check_like,
@@ -48,6 +49,7 @@ __all__ = [
     "check_pose",
     "check_poses",
     "gate_pose",
+    "sound_pose",
     "with_rotation",
 ]
 
@@ -83,7 +85,7 @@ class Pose(NamedTuple):
             >>> pose.rvec
             tensor([[0.0000, 0.0000, 0.5000]])
         """
-        return cls(*_of_vectors(axis_angle_to_rotation_matrix, "rvec", rvec, 3, translation))
+        return cls._of_vectors(axis_angle_to_rotation_matrix, "rvec", rvec, 3, translation)
 
     @classmethod
     def from_quaternion(cls, quaternion: Tensor, translation: Tensor) -> Pose:
@@ -93,7 +95,19 @@ class Pose(NamedTuple):
             quaternion: any length but 0, shape :math:`(B, 4)`.
             translation: shape :math:`(B, 3)`.
         """
-        return cls(*_of_vectors(quaternion_to_rotation_matrix, "quaternion", quaternion, 4, translation))
+        return cls._of_vectors(quaternion_to_rotation_matrix, "quaternion", quaternion, 4, translation)
+
+    @classmethod
+    def _of_vectors(
+        cls, rotate: Callable[[Tensor], Tensor], name: str, vectors: Tensor, length: int, translation: Tensor
+    ) -> Pose:
+        """Check vectors (*, length) and translations (*, 3), and convert them to poses of one dtype."""
+        check_form(["*", "3"], translation=translation)
+        check_shapes({name: (vectors, (*translation.shape[:-1], length))})
+        tensors = {name: vectors, "translation": translation}
+        check_devices(tensors, translation, "translation")
+        dtype = common_dtype(tensors)
+        return cls(rotate(vectors.to(dtype)), translation.to(dtype))
 
     @property
     def rvec(self) -> Tensor:
@@ -119,8 +133,8 @@ class Pose(NamedTuple):
         Args:
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`; or Kornia's camera, whose image size
                 replaces ``height`` and ``width``.
-            height: height of the image in pixels. Projection ignores the height.
-            width: width of the image in pixels. Projection ignores the width.
+            height: height of the image in pixels. Projection ignores the size of the image.
+            width: width of the image in pixels.
 
         Raises:
             ShapeError: when the intrinsics have other shapes.
@@ -144,18 +158,6 @@ class Pose(NamedTuple):
         return PinholeCamera(Rt_to_matrix4x4(matrices, no_shift), self.matrix.reshape(-1, 4, 4), *size)
 
 
-def _of_vectors(
-    rotate: Callable[[Tensor], Tensor], name: str, vectors: Tensor, length: int, translation: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Check vectors (*, length) and translations (*, 3), and convert them to poses of one dtype."""
-    check_form(["*", "3"], translation=translation)
-    check_shapes({name: (vectors, (*translation.shape[:-1], length))})
-    tensors = {name: vectors, "translation": translation}
-    check_devices(tensors, translation, "translation")
-    dtype = common_dtype(tensors)
-    return rotate(vectors.to(dtype)), translation.to(dtype)
-
-
 def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
     """Camera matrices (B, 3, 3) or (3, 3) of ``intrinsics``. The extrinsics of Kornia's camera are ignored."""
     if not isinstance(intrinsics, PinholeCamera):
@@ -176,11 +178,12 @@ def check_poses(estimate: Pose, truth: Pose) -> None:
     check_pose("estimate", estimate)
     check_pose("truth", truth)
     shape = tuple(estimate.translation.shape)
-    tensors: dict[str, Tensor] = {}
+    shapes: Shapes = {}
     for name, pose in (("estimate", estimate), ("truth", truth)):
-        tensors |= {f"The rotation of the {name}": pose.rotation, f"The translation of the {name}": pose.translation}
-    check_shapes({name: (x, (*shape, 3) if "rotation" in name else shape) for name, x in tensors.items()})
-    check_like(tensors, truth.translation, "the translation of the truth")
+        shapes[f"The rotation of the {name}"] = pose.rotation, (*shape, 3)
+        shapes[f"The translation of the {name}"] = pose.translation, shape
+    check_shapes(shapes)
+    check_like({name: x for name, (x, _) in shapes.items()}, truth.translation, "the translation of the truth")
 
 
 @full_precision
@@ -191,6 +194,13 @@ def with_rotation(pose: Pose) -> Pose:
     usable = unique & (torch.linalg.det(matrices.detach()) > 0)
     rotation = torch.where(usable[:, None, None], rotation.permute(2, 0, 1), torch.nan)
     return Pose(rotation.reshape(pose.rotation.shape), pose.translation)
+
+
+def sound_pose(pose: Pose, sound: Tensor) -> Pose:
+    """Replace the poses (*) that are not ``sound``, bool (*), by the identity, without gradient."""
+    eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
+    rotation = torch.where(sound[..., None, None], pose.rotation, eye)
+    return Pose(rotation, torch.where(sound[..., None], pose.translation, 0.0))
 
 
 def gate_pose(pose: Pose, live: Tensor, finite: Tensor) -> Pose:
@@ -210,9 +220,9 @@ class PosePrior(NamedTuple):
         pose: the expected world-to-camera pose.
         information: inverse of the covariance in radians and the unit of the world, positive semi-definite, shape
             :math:`(B, 6, 6)`. An unknown component of :math:`(\omega, v)` has zeros in its row and column.
-        scale: scale :math:`c` of Welsch's kernel, shape :math:`(B,)`; ``None``: 3. Let :math:`k` be the rank of
-            ``information``, and :math:`s` the squared Mahalanobis distance between prior and pose. The weight of the
-            prior is :math:`\exp(-2 s / (k c^2))`. An incorrect prior therefore does not spoil a pose that the pairs
+        scale: scale :math:`c` of Welsch's kernel, shape :math:`(B,)`; ``None``: 3. The weight of the prior is
+            :math:`\exp(-2 s / (k c^2))`, where :math:`k` is the rank of ``information``, and :math:`s` the squared
+            Mahalanobis distance between prior and pose. An incorrect prior thus does not spoil a pose that the pairs
             determine. With an infinite scale the weight is 1.
     """
 
@@ -327,10 +337,9 @@ class PnPResult(NamedTuple):
     def __repr__(self) -> str:
         """Five lines: the number of problems that are ok, medians and ranges of what the solver knows, and the pose."""
         shown = self.ok, self.status, self.inliers, self.sigma, self.probability, *self.pose
-        known = [x for x in shown if type(x) is Tensor and sees_values(x) and x.numel()]
-        if len(known) < len(shown):
+        if not all(type(x) is Tensor and sees_values(x) and x.numel() for x in shown):
             return tuple.__repr__(self)
-        flat = (x.detach().reshape(-1, *x.shape[self.ok.ndim :]) for x in known)
+        flat = (x.detach().reshape(-1, *x.shape[self.ok.ndim :]) for x in shown)
         ok, status, inliers, sigma, probability, rotation, translation = flat
 
         def spread(values: Tensor) -> str:
@@ -371,9 +380,10 @@ class PnPResult(NamedTuple):
             img_points: the pixels of the solver's call.
             intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the ``intrinsics`` of the
                 result replace them.
-            noise: further arguments of ``pose_covariance``. Noise that is not given is estimated from the residuals of
-                the inliers (see :func:`~kornia_pnpnet.covariance.shown_noise`); if only noise of the points is given,
-                the noise of the pixels is ``sigma``. The default weights are ``inliers``.
+            noise: further arguments of ``pose_covariance``. The default weights are ``inliers``. Without noise, the
+                noise is estimated from the residuals of the inliers (see
+                :func:`~kornia_pnpnet.covariance.shown_noise`). With noise of the points only, ``sigma`` is the noise of
+                the pixels.
 
         Returns:
             Shape :math:`(B, 6, 6)`, see ``pose_covariance``.

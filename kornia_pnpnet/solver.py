@@ -10,7 +10,7 @@ from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.arguments import Inputs, checked_inputs, given_cameras, joined, restore_leading, split_batch
+from kornia_pnpnet.arguments import checked_inputs, given_cameras, in_parts, restore_leading
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Runner, in_full_precision, in_turn, sees_values
@@ -18,7 +18,7 @@ from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.core.watch import GradientWatch
 from kornia_pnpnet.frame import Frame, Normalize
 from kornia_pnpnet.pretrained import PretrainedMixin
-from kornia_pnpnet.problem import Problem, Starts
+from kornia_pnpnet.problem import Inputs, Problem, Starts
 from kornia_pnpnet.propose.alternatives import find_alternatives, reconsider
 from kornia_pnpnet.propose.first import propose
 from kornia_pnpnet.propose.focal import (
@@ -40,9 +40,8 @@ __all__ = ["PnPNet"]
 
 # Largest norm of the gradient of a problem's loss with respect to normalised inputs. Usual norms are about 1.
 _LONGEST_GRADIENT = 10.0
-# Additional iterations from a nominal focal length. With 1000 pairs, fewer than four do not converge. With 2, 4 and 8
-# iterations the median error of the focal length is 0.037, 0.029 and 0.030 % (CameraProblems, seeds 4321, 4322, half
-# outliers). Radial distortion gets its gradient from these iterations, because the search has no gradient.
+# Additional iterations from a nominal focal length: with 1000 pairs, fewer do not converge (CameraProblems, seeds 4321,
+# 4322). Radial distortion gets its gradient from these iterations, because the search has no gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -83,23 +82,21 @@ class PnPNet(PretrainedMixin):
 
     Args:
         init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to
-            :class:`~kornia_pnpnet.problem.Starts`, see ``kornia_pnpnet.propose``. ``None``: the refinement starts from
-            ``init`` or ``prior`` of the call, else from the identity.
+            :class:`~kornia_pnpnet.problem.Starts`. ``None``: the refinement starts from ``init`` or ``prior`` of the
+            call, else from the identity.
         refine: the refiner. ``None``: a classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM`.
         normalize: the normalisation; the default centres and scales the world and sorts the pairs.
         effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples (see
             :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
-            :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. Other
-            efforts compare poses with their rivals in evaluation mode (see
-            :func:`~kornia_pnpnet.propose.alternatives.reconsider`). ``None``: adaptive in evaluation mode if the
-            initialiser estimates the noise and the refinement has iterations, else fixed. The effort is always fixed in
-            exported graphs, with ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``. For rigs
-            and bearings the number of minimal samples is adaptive unless the effort is ``"fixed"`` or the solver is
-            compiled.
+            :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
+            adaptive in evaluation mode if the initialiser estimates the noise and the refinement has iterations.
+            Unless the effort is ``"fixed"``, poses are compared with their rivals in evaluation mode (see
+            :func:`~kornia_pnpnet.propose.alternatives.reconsider`), and RANSAC for rigs and bearings chooses the number
+            of its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in
+            ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``, with a ``RuntimeWarning``
-            if the first batches of a training have none. ``"always"``: all valid problems. The gradient of each
-            problem's loss with respect to its normalised inputs then has a norm of at most 10. A step against the
-            gradient lowers the loss, but a pose does not determine where the pixels move. To train a network from
+            if the first batches of a training have none. ``"always"``: all valid problems; the gradient of each
+            problem's loss with respect to its normalised inputs then has a norm of at most 10. To train a network from
             nothing, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8: the problem itself and its mirror images, for which a network
             proposes different poses (see :mod:`kornia_pnpnet.propose.views`).
@@ -107,7 +104,7 @@ class PnPNet(PretrainedMixin):
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
             focal length. With ``SetInit`` the refinement starts from a nominal focal length. If the result is not
             believed, or with another initialiser, a search with P3P finds an initial focal length. A problem is not
-            ``ok`` when the pairs leave the focal length open. ``"known"``: the intrinsics give the focal length.
+            ``ok`` when the pairs leave the focal length open.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
         radial: number of coefficients of radial distortion that are estimated with an unknown focal length, 0 to 2. The
@@ -261,7 +258,11 @@ class PnPNet(PretrainedMixin):
             cam_from_rig=cam_from_rig,
         )
         check_whole(0, alternatives=alternatives)
-        self._check_cameras(inputs, distorted=dist is not None or fisheye is not None, alternatives=alternatives)
+        rig = inputs.rig is not None
+        if self.focal == "unknown" and (rig or dist is not None or fisheye is not None):
+            raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
+        if rig and (alternatives or (self.init is None and inputs.init is None)):
+            raise ValueCheckError("A rig or bearings have no alternatives, and need an initialiser or `init`.")
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
         with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points):
             compiled = self._run.compiled or self._whole.compiled
@@ -269,11 +270,11 @@ class PnPNet(PretrainedMixin):
             if compiled:  # a batch of one, or another memory layout, would need a new compilation
                 inputs = map_tensors(lambda x: torch.cat((x, x)) if single else x.contiguous(), inputs)
             any_number = not (compiled or trait(self.init, "fixed_pairs"))
-            parts = split_batch(inputs, trait(self.init, "pairs_at_once"), any_number)
-            result = joined(parts, [self._whole(self._solve, part.inputs, call) for part in parts])
+            most = trait(self.init, "pairs_at_once")
+            result = in_parts(lambda part: self._whole(self._solve, part, call), inputs, most, any_number)
         result = restore_leading(size, map_tensors(lambda x: x[:1], result) if single else result)
-        if inputs.rig is not None:
-            result = result._replace(intrinsics=given_cameras(intrinsics, world_points, result.translation))
+        if rig:
+            result = result._replace(intrinsics=given_cameras(intrinsics, size, result.translation))
         if not (call.always or first_stage_only):
             self._watch.see(result.ok, *inputs[:4])
         return result
@@ -304,9 +305,8 @@ class PnPNet(PretrainedMixin):
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
-            whole: compile the solver with all iterations as one graph. The first call takes longer. Calls with few
-                problems take half the time, because they run less Python code. The effort is fixed, because a search
-                cannot be part of a graph.
+            whole: compile the solver with all iterations as one graph of fixed effort. The first call takes longer.
+                Calls with few problems take half the time, because they run less Python code.
         """
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
@@ -332,9 +332,14 @@ class PnPNet(PretrainedMixin):
 
     def _attempt(self, inputs: Inputs, call: _Call, *, nominal: bool = False) -> _Attempt:
         """Propose poses, refine them, and judge the best pose. ``nominal``: whether the focal length is nominal."""
-        adapts, rival, replaced = self._adapts(inputs, call), None, None
+        fixed = call.first_stage_only or self.effort == "fixed" or inputs.rig is not None
+        free = not fixed and sees_values(inputs.world_points)
+        can_adapt = trait(self.init, "estimates_noise") and self.refine.m > 0
+        adapts = free and (self.effort == "adaptive" or (can_adapt and not self.training))
+        compares = free and not self.training and not self._whole.compiled
         searches = adapts and self.focal == "known"  # an unknown focal length has another search
         problem, frame, starts = self._run(self._propose, inputs, call, searches and inputs.confidence is None)
+        rival = replaced = found = odds = None
         if searches:
             keep_others = inputs.init is not None or inputs.prior is not None
             starts, rival = search_on(problem, starts, keep_others=keep_others)
@@ -346,17 +351,15 @@ class PnPNet(PretrainedMixin):
         plan = self._run(self.refine.begin, seen, starts)
         more = _MORE_ITERATIONS if nominal or self.radial else 0
         plan, now = self.refine.iterate(plan, 0 if call.first_stage_only else None, more=more, run=self._run)
-        found = odds = None
-        if self._compares(inputs, call):
+        if compares:
             found = plan.evidence_at(now.state)
             if nominal and adapts:
                 doubted = frame.valid & ~self.refine.judge(plan, now, found).ok
                 rival, replaced = find_focal(problem, now.state, doubted)
             now, found, odds = reconsider(self.refine, plan, now, found, frame.valid, rival, replaced)
         refined = self._run(self.refine.judge, plan, now, found, odds)
-        return _Attempt(
-            problem, frame, starts, refined, self._run(self._result, problem.focal, frame, starts, refined, call)
-        )
+        result = self._run(self._result, problem.focal, frame, starts, refined, call)
+        return _Attempt(problem, frame, starts, refined, result)
 
     def _propose(self, inputs: Inputs, call: _Call, search_follows: bool) -> tuple[Problem, Frame, Starts]:
         """Normalise the inputs and propose poses."""
@@ -429,20 +432,6 @@ class PnPNet(PretrainedMixin):
             frame.undo_pairs(found.inlier).gt(0.5) & finite[:, None],
         )
 
-    def _compares(self, inputs: Inputs, call: _Call) -> bool:
-        """Whether the poses of a call are compared with their rivals, see :class:`PnPNet`."""
-        fixed = call.first_stage_only or self.effort == "fixed" or inputs.rig is not None or self._whole.compiled
-        return not (fixed or self.training) and sees_values(inputs.world_points)
-
-    def _adapts(self, inputs: Inputs, call: _Call) -> bool:
-        """Whether the effort of a call is adaptive, see :class:`PnPNet`."""
-        if call.first_stage_only or self.effort == "fixed" or inputs.rig is not None:
-            return False
-        if not sees_values(inputs.world_points):
-            return False
-        can = trait(self.init, "estimates_noise") and self.refine.m > 0
-        return self.effort == "adaptive" or (can and not self.training)
-
     @torch.no_grad()
     def _with_alternatives(self, attempt: _Attempt, most: int) -> PnPResult:
         """Add to the result the other poses that explain the pairs nearly as well."""
@@ -451,14 +440,6 @@ class PnPNet(PretrainedMixin):
         poses = frame.undo(Pose(found.rotation, found.translation))
         translation = torch.where(found.valid[..., None], poses.translation, 0.0)
         return result._replace(alternatives=found._replace(translation=translation))
-
-    def _check_cameras(self, inputs: Inputs, *, distorted: bool, alternatives: int) -> None:
-        """Refuse arguments that cannot be combined: an unknown focal length, distortion, rigs and alternatives."""
-        rig = inputs.rig is not None
-        if self.focal == "unknown" and (rig or distorted):
-            raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
-        if rig and (alternatives or (self.init is None and inputs.init is None)):
-            raise ValueCheckError("A rig or bearings have no alternatives, and need an initialiser or `init`.")
 
 
 def _checked_gradient(gradient: str) -> str:

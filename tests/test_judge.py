@@ -13,8 +13,7 @@ from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.judge.belief import LAW, LEAST_PROBABILITY
-from kornia_pnpnet.judge.evidence import Votes, at_pose, copies, evidence
+from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, at_pose, copies, evidence
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Noise, Problem, State
 from kornia_pnpnet.refine.residual import project

@@ -33,7 +33,7 @@ from kornia_pnpnet.propose.minimal import SubsetSolver
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.reppnp import REPPnP
-from kornia_pnpnet.refine.parameters import BoundedParameter
+from kornia_pnpnet.refine.kernels import BoundedParameter
 from kornia_pnpnet.training import TrainSettings
 
 PROBLEMS = SyntheticProblems(n=12, batch_size=3, seed=0).batch(0)

@@ -8,7 +8,7 @@ from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import Pose, create_solver, p3p, pose_errors, success
 from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.judge.belief import LEAST_PROBABILITY
+from kornia_pnpnet.judge.evidence import LEAST_PROBABILITY
 
 NAMES = ["pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac"]
 

@@ -1,6 +1,6 @@
 """Fit the law of ``PnPResult.probability``, and measure the effect of each part of the judge. ``make.py`` calls this.
 
-See ``kornia_pnpnet.judge.belief``. The coefficients go from ``probability.json`` into the code by hand; a test compares
+See ``kornia_pnpnet.judge.evidence``. The coefficients go from ``probability.json`` into the code by hand; a test compares
 them.
 """
 
@@ -25,7 +25,7 @@ from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import ObjectPoints, OutlierMix, SceneProblems, SyntheticProblems, load_scene
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.judge import belief, evidence
+from kornia_pnpnet.judge import evidence
 from kornia_pnpnet.metrics import pose_errors, reliability, success_rate
 from kornia_pnpnet.propose import alternatives
 from kornia_pnpnet.refine.lm import RobustWeightedLM
@@ -48,7 +48,7 @@ def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
     """
     law = fit_law([solved(name, kind) for name in FITTED for kind in kinds(seed_fit) if in_fit(kind.name)])
     made: dict[str, Any] = {"environment": environment(), "law": law}
-    with mock.patch.object(belief, "LAW", law):
+    with mock.patch.object(evidence, "LAW", law):
         for name in (*FITTED, *MEASURED):
             rows = {kind.name: solved(name, kind) for kind in kinds(seed_report)}
             fitted = [row for kind, row in rows.items() if in_fit(kind)]
@@ -113,9 +113,9 @@ def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
         turn, shift = errors(result.pose, kind.truth)
         shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
-    variables = torch.stack(belief.clipped(log_ratio, sigma), -1).double()
+    variables = torch.stack(evidence.clipped(log_ratio, sigma), -1).double()
     # A rival multiplies the probability of the law. The fit leaves out poses that fail a test, and poses with a rival.
-    alone = probability >= 0.99 * belief.probability(log_ratio, sigma)
+    alone = probability >= 0.99 * evidence.probability(log_ratio, sigma)
     found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right}
     return {**found, "variables": variables, "alone": alone & (probability > 0)}
 
@@ -169,9 +169,9 @@ PARTS: dict[str, tuple[Any, str, Any]] = {
     "rival of larger noise": (alternatives, "_GAP", -math.inf),
     "rival of the search": (alternatives, "_APART", math.inf),
     "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
-    "limit of the pose's standard deviation": (belief, "_OPEN", math.inf),
-    "limit of the noise": (belief, "_MOST_NOISE", math.inf),
-    "points off a line": (belief, "_leave_a_line", _any_points),
+    "limit of the pose's standard deviation": (evidence, "_OPEN", math.inf),
+    "limit of the noise": (evidence, "_MOST_NOISE", math.inf),
+    "points off a line": (evidence, "_leave_a_line", _any_points),
 }
 
 

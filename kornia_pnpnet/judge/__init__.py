@@ -1,1 +1,1 @@
-"""Judge a pose: ``inliers`` finds the inliers of the pose, and ``belief`` tells whether the pose is to be believed."""
+"""Judge a pose: ``inliers`` finds its inliers by thresholds, ``evidence`` tells whether it is to be believed."""

@@ -1,19 +1,19 @@
 r"""The evidence for a pose: how much likelier the pairs are with this pose than without a pose.
 
-*Model.* The residual of an inlier is Gaussian. One of ten inliers has three times the standard deviation. The pixel of
-an outlier is uniformly distributed in a square that has the variance of the pixels. Let :math:`w` be the share of
-inliers, and let :math:`s` be a factor of all standard deviations. Let :math:`d_i(s)` be the density of pair :math:`i`
-as an inlier, divided by its density as an outlier. The log-likelihood ratio is
+The residual of an inlier is Gaussian. One of ten inliers has three times the standard deviation. The pixel of an
+outlier is uniformly distributed. Let :math:`w` be the share of inliers, :math:`s` a factor of all variances, and
+:math:`d_i(s)` the density of pair :math:`i` as an inlier, divided by its density as an outlier. The log-likelihood
+ratio
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
-without its three largest terms, because some pose fits any three pairs. Copies of a pair share one vote :math:`v_i`.
-Expectation and maximisation estimate the share :math:`w`. If the noise is unknown, the factors :math:`s` are a grid of
-angles, which has the same meaning for all cameras. If the caller gave the noise, the factor is 1 or, with a low prior
-probability, larger.
+leaves out its three largest terms, because some pose fits any three pairs. Copies of a pair share one vote :math:`v_i`.
+Expectation and maximisation estimate :math:`w`. If the noise is unknown, :math:`s` is a grid of angles; if the caller
+gave the noise, :math:`s` is 1 or, with a low prior probability, larger.
 
-*Evidence.* The evidence is the logarithm of the mean of :math:`\exp L(s)` over the factors, minus the logarithms of the
-number of minimal samples and of the number of poses per sample.
+The *evidence* is the logarithm of the mean of :math:`\exp L(s)`, minus the logarithms of the number of minimal samples
+and of the number of poses per sample. A pose is to be *believed* if the evidence suffices and the inliers determine the
+pose accurately.
 
 The results have no gradient.
 """
@@ -27,12 +27,29 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_pnpnet.core.linalg import solve_symmetric
 from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, State
-from kornia_pnpnet.refine.information import information
-from kornia_pnpnet.refine.residual import Projection, project
+from kornia_pnpnet.refine.residual import Projection, information, normal_equations, project
 
-__all__ = ["AtPose", "Evidence", "Mixture", "Votes", "at_pose", "copies", "evidence", "updated"]
+__all__ = [
+    "FAR_TURN",
+    "LAW",
+    "LEAST_PROBABILITY",
+    "AtPose",
+    "Evidence",
+    "Mixture",
+    "Votes",
+    "at_pose",
+    "believe",
+    "clipped",
+    "copies",
+    "evidence",
+    "pose_sigma",
+    "probability",
+    "updated",
+]
 
 # Unknown noise: the smallest standard deviation of the grid in radians, the ratio of neighbouring variances, and the
 # number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
@@ -41,9 +58,8 @@ _LEAST_ANGLE, _STEP, _SCALES = 1e-4, 8.0, 6
 _UNEXPECTED = -3.0
 # Rounds of expectation and maximisation: for the share of inliers at each factor, and for the final factor and share.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
-# Real residuals have heavy tails. The model therefore has a second kind of inliers: the first number is their share of
-# all inliers, and the second number is the factor of their variance. With one kind of inliers, success on indoor RGB-D
-# matches falls by 2.5 points.
+# The second kind of inliers, for the heavy tails of real residuals: their share of all inliers, and the factor of their
+# variance. With one kind of inliers, success on indoor RGB-D matches falls by 2.5 points.
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
@@ -53,9 +69,28 @@ _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Number of poses of a minimal sample.
 _POSES = 4
 # Rows are sorted by a key, the sum of their columns times powers of this number, so that equal rows are adjacent. The
-# number is transcendental, so that different rows of integers have different keys. The powers are computed on the
-# device, because a CUDA graph cannot contain a copy from the CPU.
+# number is transcendental, so that different rows of integers have different keys.
 _KEY = math.pi / 4
+
+#: A pose is believed when its :func:`probability` is at least this value.
+LEAST_PROBABILITY = 0.9
+#: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
+#: logarithm of ``sigma``. ``python docs/results/make.py measure --only probability`` fitted the law.
+LAW = (-1.573, 0.6221, -0.4594)
+_EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
+#: Largest errors of a correct pose: of the rotation in radians, and of the translation as a share of the distance.
+FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
+# Largest `pose_sigma` of a pose that is believed. Two standard deviations are the largest error of a correct pose.
+_OPEN = 0.5
+# Radians. Largest standard deviation of plausible noise. With 0.0125, 4 % of the correct poses of indoor RGB-D matches
+# (`rgbd/indoor.npz`, without a ratio test) would not be believed.
+_MOST_NOISE = 0.016
+# A point lies off a line if its distance exceeds this factor times the standard deviation of the points along the line.
+_OFF = 0.05
+# With this number of inliers, one point off the line suffices. Each further inlier requires a further point, up to 3.
+_FEW = 5
+# Rounds of the robust fit of the line, and squarings of the covariance for its first eigenvector.
+_LINE_ROUNDS, _SQUARINGS = 3, 3
 
 
 class Votes(NamedTuple):
@@ -64,8 +99,8 @@ class Votes(NamedTuple):
     Attributes:
         pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
         known: whether the caller gave the noise of a problem, bool (B, 1).
-        outlier: density of an outlier's pixel, divided by the density of a narrow inlier at the projection, if the
-            variance of the inlier is 1 px² and half of the pairs are inliers, (B, 1).
+        outlier: density of an outlier's pixel, divided by the density of a narrow inlier of variance 1 px² at the
+            projection, if half of the pairs are inliers, (B, 1).
     """
 
     pairs: Tensor
@@ -126,10 +161,7 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Relative densities (B, N) of inliers, of inliers each divided by its factor of the variance, and of outliers.
-
-        ``exponent`` and ``outlier`` are those of :class:`AtPose`.
-        """
+        """Densities (B, N) of inliers, of inliers divided by their factor of the variance, and of outliers."""
         scaled = exponent / self.variance
         narrow, wide = scaled.exp(), (scaled / _WIDE).exp()
         share = _TAIL / (1.0 - _TAIL) / _WIDE
@@ -163,7 +195,7 @@ class Evidence(NamedTuple):
 
     @property
     def likelihood(self) -> Tensor:
-        """The largest entry of ``grid``, which compares poses of one problem, shape (B,)."""
+        """The largest entry of ``grid``, (B,), for the comparison of poses of one problem."""
         return self.grid.amax(1)
 
 
@@ -187,7 +219,9 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
     there, total = votes.pairs > 0, votes.pairs.sum(-1, keepdim=True).clamp(min=1.0)
     mean = torch.where(there, density.log(), 0.0).sum(-1, keepdim=True) / there.sum(-1, keepdim=True).clamp(min=1)
     radian = problem.focal.square() * mean.exp()
-    factors, log_prior = _grid(radian, votes.known)  # (F, B, 1) each
+    power = torch.arange(_SCALES, dtype=radian.dtype, device=radian.device)[:, None, None]
+    factors = torch.where(votes.known, 1.0, _LEAST_ANGLE**2 * radian) * _STEP**power  # (F, B, 1)
+    log_prior = torch.where(votes.known, _UNEXPECTED * power, -math.log(_SCALES))
     share = factors.new_full((), 0.5)
     inlier, _, outlier = Mixture(factors, share, factors, total).densities(exponent, outliers)  # (F, B, N)
     chances, more = votes.pairs / total * inlier, inlier - outlier
@@ -226,9 +260,9 @@ def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
 
 @torch.no_grad()
 def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None = None) -> Mixture:
-    """One round of expectation and maximisation.
+    """One round of expectation and maximisation. Problems ``frozen``, bool (B, 1), keep their variance.
 
-    The variance of problems ``frozen``, bool (B, 1), does not change; ``None``: of those with noise from the caller.
+    ``None``: the problems with noise from the caller are frozen.
     """
     exponent = seen.exponent.detach()
     inlier, weighted, outlier = mixture.densities(exponent, seen.outlier.detach())
@@ -242,8 +276,107 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
     )
 
 
-def _grid(radian: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Factors of the variances and their prior log-probabilities, (F, B, 1) each."""
-    number = torch.arange(_SCALES, dtype=radian.dtype, device=radian.device)[:, None, None]
-    factors = torch.where(known, 1.0, _LEAST_ANGLE**2 * radian) * _STEP**number
-    return factors, torch.where(known, _UNEXPECTED * number, -math.log(_SCALES))
+@torch.no_grad()
+def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The :func:`probability` of a pose, whether it is to be believed, bool, and its :func:`pose_sigma`, all (B,).
+
+    The probability must be at least `LEAST_PROBABILITY`, and :func:`pose_sigma` must be small. The points of the
+    inliers must span more than a line. The noise must be plausible, or ``known`` (B, 1) from the caller: pairs of a
+    wrong convention, such as mirrored pixels, show much noise at their best pose.
+    """
+    scale = found.inlier / found.mixture.variance
+    precision = map_tensors(lambda x: scale * x, seen.precision)
+    sigma = pose_sigma(seen.projection, problem, precision).detach()
+    plausible = (found.sigma < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
+    usable = plausible & (sigma < _OPEN) & _leave_a_line(problem.world_points, found.inlier > 0.5)
+    chances = torch.where(usable, probability(found.log_ratio, sigma).to(problem.weights), 0.0)
+    return chances, usable & (chances >= LEAST_PROBABILITY), sigma
+
+
+def probability(log_ratio: Tensor, sigma: Tensor) -> Tensor:
+    """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
+
+    It is a logistic function of the evidence ``log_ratio`` and of the logarithm of :func:`pose_sigma`, both (B,).
+    """
+    evidence, log_sigma = clipped(log_ratio, sigma)
+    offset, by_evidence, by_sigma = LAW
+    return torch.sigmoid(offset + by_evidence * evidence + by_sigma * log_sigma)
+
+
+def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """Clip the two variables of :data:`LAW`, the evidence and the logarithm of sigma, to their ranges."""
+    return log_ratio.clamp(*_EVIDENCE), sigma.log().clamp(*_LOG_SIGMA).to(log_ratio.dtype)
+
+
+def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
+    """Standard deviation of the pose in units of the largest errors of a correct pose, float64, (B,).
+
+    The variances of rotation, translation and an unknown focal length, which changes the distance, are added.
+    ``precision`` is the inverse variance (or covariance) of each pixel in px^-2, (B, N), 0 for outliers. The result is
+    infinite for an undetermined pose.
+    """
+    precision = map_tensors(lambda x: problem.focal.square() * x, precision)
+    matrix = normal_equations(projection, problem, precision).matrix
+    matrix = matrix.permute(2, 0, 1).double()
+    variance = torch.zeros_like(matrix[:, 0, 0])
+    for k in range(matrix.shape[-1] - 1, 5, -1):  # the camera is eliminated (Schur complement)
+        cross, own = matrix[:, k : k + 1, :k], matrix[:, k, k]
+        if k == 6:
+            if problem.free_focal is not None and problem.free_focal.information is not None:
+                own = own + problem.free_focal.information
+            # The depth of the points grows with the focal length, see `refine.residual.moved`.
+            left = own - _form(matrix[:, :6, :6], cross[:, 0])
+            variance = torch.where(left > 0, left.reciprocal(), torch.inf) / _FAR_SHIFT**2
+        matrix = matrix[:, :k, :k] - cross.mT * cross / own[:, None, None].clamp(min=torch.finfo(own.dtype).tiny)
+    above, below = matrix.split(3, 1)
+    turn, (cross, shift) = above[..., :3], below.split(3, -1)
+    points = projection.rotated + projection.state.pose.translation.mT[:, None]
+    distance = points.square().sum(0).sqrt().mT.double()
+    share = (precision if isinstance(precision, Tensor) else precision.uu).double()
+    total = share.sum(-1).clamp(min=torch.finfo(torch.float32).tiny)
+    sq_distance = ((share * distance).sum(-1) / total).square()
+    for own, other, mixed, unit in (
+        (turn, shift, cross, FAR_TURN**2),
+        (shift, turn, cross.mT, _FAR_SHIFT**2 * sq_distance),
+    ):
+        # The other block is eliminated (Schur complement).
+        left = torch.baddbmm(own, mixed.mT, solve_symmetric(other, mixed), alpha=-1)
+        eye = torch.eye(3, dtype=left.dtype, device=left.device)
+        part = solve_symmetric(left, eye.expand_as(left)).diagonal(dim1=1, dim2=2).sum(-1)
+        variance = variance + torch.where(part > 0, part, torch.inf) / unit  # NaN becomes infinite, too
+    return torch.where(variance > 0, variance, torch.inf).sqrt()
+
+
+def _form(matrix: Tensor, vector: Tensor) -> Tensor:
+    """The product v^T M^-1 v (B,) of symmetric matrices (B, 6, 6) and vectors (B, 6), by blocks of three."""
+    turn, cross, shift = matrix[:, :3, :3], matrix[:, 3:, :3], matrix[:, 3:, 3:]
+    first, last = vector[:, :3, None], vector[:, 3:, None]
+    solved = solve_symmetric(shift, torch.cat((cross, last), -1))
+    left, right = turn - cross.mT @ solved[..., :3], first - cross.mT @ solved[..., 3:]
+    parts = last.mT @ solved[..., 3:] + right.mT @ solve_symmetric(left, right)
+    form = parts[:, 0, 0]
+    return torch.where(form.isnan(), torch.inf, form)  # ONNX has no `nan_to_num` of float64
+
+
+def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
+    """Whether enough points (B, N, 3) of the inliers (B, N) lie off a line, bool (B,).
+
+    A line leaves one rotation free, so that a few outliers can determine a pose by chance.
+    """
+    weights = there = inliers.to(world_points.dtype)[..., None]  # (B, N, 1)
+    tiny = torch.finfo(weights.dtype).tiny
+    for _ in range(_LINE_ROUNDS):
+        share = weights / weights.sum(1, keepdim=True).clamp(min=tiny)
+        centred = world_points - torch.bmm(share.mT, world_points)
+        matrix = torch.bmm(centred.mT, share * centred)
+        matrix = matrix / matrix.norm(dim=(1, 2), keepdim=True).clamp(min=tiny)
+        for _ in range(_SQUARINGS):  # the direction of the line is the first eigenvector
+            matrix = torch.bmm(matrix, matrix)
+        direction = matrix.sum(-1, keepdim=True)
+        direction = direction / direction.norm(dim=1, keepdim=True).clamp(min=tiny)
+        along = torch.bmm(centred, direction)
+        sq_off = torch.baddbmm(centred, along, direction.mT, alpha=-1).square().sum(-1, keepdim=True)
+        limit = _OFF**2 * torch.bmm(share.mT, along.square())
+        weights = there / (sq_off + limit.clamp(min=tiny**0.5))
+    off = (inliers & (sq_off > limit)[..., 0]).sum(-1)
+    return off >= (inliers.sum(-1) - _FEW).clamp(1, MIN_PAIRS)

@@ -1,8 +1,8 @@
 r"""Find the inliers of a pose by thresholds.
 
 A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
-:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point, which moves the projection by
-:math:`f \omega / z` pixels. The ratio of both sides is the *standardised* squared residual.
+:math:`\tau` is in pixels, the threshold :math:`\omega` is a shift of the world point. The ratio of both sides is the
+*standardised* squared residual.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ class Judged(NamedTuple):
 
     Attributes:
         weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for all other pairs, shape :math:`(B, N)`.
-        errors: standardised squared residuals, below 1 for inliers, :data:`MAX_ERROR` behind the camera, shape
-            :math:`(B, N)`.
+        errors: standardised squared residuals, :data:`MAX_ERROR` behind the camera, shape :math:`(B, N)`.
     """
 
     weights: Tensor

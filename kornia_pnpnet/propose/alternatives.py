@@ -11,8 +11,7 @@ from torch.nn import functional
 from kornia_pnpnet.core.linalg import eigenvectors
 from kornia_pnpnet.core.performance import problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors, put, take
-from kornia_pnpnet.judge.belief import FAR_TURN
-from kornia_pnpnet.judge.evidence import Evidence
+from kornia_pnpnet.judge.evidence import FAR_TURN, Evidence
 from kornia_pnpnet.problem import Problem, Starts, State
 from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.scoring import as_entries, as_pose

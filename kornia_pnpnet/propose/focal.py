@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_pnpnet.arguments import Inputs, with_undistorted
-from kornia_pnpnet.cameras import focal_length, pinholes
+from kornia_pnpnet.cameras import focal_length, pinholes, with_undistorted
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
+from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.search import CAUCHY, cauchy_scale, least_squares

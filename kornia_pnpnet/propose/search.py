@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import compiling, present_first
 from kornia_pnpnet.core.trees import map_tensors, take
-from kornia_pnpnet.judge.belief import pose_sigma
+from kornia_pnpnet.judge.evidence import pose_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge, median_residual, residual_noise
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.minimal import MinimalSolver

@@ -1,25 +1,29 @@
-r"""Robust kernels: the weight of a pair as a function of its squared residual.
-
-To add a kernel, add an entry to :data:`KERNELS`.
+r"""Robust kernels: the weight of a pair as a function of its squared residual. Hyperparameters within bounds.
 
 A kernel is a loss :math:`\rho(s)` of the squared residual and its derivative :math:`w(s)`. The residual is in pixels of
 the normalised camera or, if the noise is known, in standard deviations. The *shape* of ``huber``, ``cauchy``,
 ``geman_mcclure`` and ``truncated`` is a scale in the unit of the residual. The shape of ``power`` is the exponent
-:math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net.
+:math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net. To add a kernel, add an entry to :data:`KERNELS`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from kornia.core.check import KORNIA_CHECK
+from torch import Tensor, nn
 
-__all__ = ["KERNELS", "POWER_FLOOR", "RobustKernel"]
+from kornia_pnpnet.core.checks import check_numbers, check_whole
+
+__all__ = ["KERNELS", "POWER_FLOOR", "BoundedParameter", "RobustKernel"]
 
 #: Pixels. ``power`` adds the square of this number to squared residuals, so that the weight at 0 is finite.
 POWER_FLOOR = 0.1
+# Largest absolute value of a raw parameter. The sigmoid of 1000 rounds to 1 in float64.
+_BOUND = 1e3
 
 
 class RobustKernel(NamedTuple):
@@ -37,13 +41,9 @@ class RobustKernel(NamedTuple):
     loss: Callable[[Tensor, Tensor], Tensor]
     weight: Callable[[Tensor, Tensor], Tensor]
     default: float
-    lower: float
-    upper: float
-    logarithmic: bool
-
-
-def _power_weight(sq_residual: Tensor, alpha: Tensor) -> Tensor:
-    return torch.exp(-0.5 * alpha * torch.log(sq_residual + POWER_FLOOR**2))
+    lower: float = 0.1
+    upper: float = 1e4
+    logarithmic: bool = True
 
 
 def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:
@@ -61,47 +61,81 @@ def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:
     return floor**exponent * log_ratio * relative
 
 
-def _huber_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    return scale * sq_residual.maximum(scale * scale).rsqrt()
-
-
 def _huber_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
     square = scale * scale
     return sq_residual.minimum(square) + 2.0 * scale * (sq_residual.maximum(square).sqrt() - scale)
-
-
-def _cauchy_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    return 1.0 / (1.0 + sq_residual / (scale * scale))
-
-
-def _cauchy_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    return scale * scale * torch.log1p(sq_residual / (scale * scale))
-
-
-def _geman_mcclure_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    return (1.0 + sq_residual / (scale * scale)) ** -2
-
-
-def _geman_mcclure_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    return sq_residual / (1.0 + sq_residual / (scale * scale))
-
-
-def _truncated_weight(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    # Distributed training expects a gradient of every parameter. The zero term therefore keeps the scale in the graph.
-    return (sq_residual < scale * scale).to(sq_residual.dtype) + 0.0 * scale
-
-
-def _truncated_loss(sq_residual: Tensor, scale: Tensor) -> Tensor:
-    return torch.minimum(sq_residual, scale * scale)
 
 
 #: The kernels by name. ``power`` is the kernel of PnP-Net. The other kernels are common M-estimators (Z. Zhang,
 #: "Parameter estimation techniques", Image and Vision Computing 15(1), 1997, table 1). ``truncated`` is the truncated
 #: least squares of MSAC.
 KERNELS: dict[str, RobustKernel] = {
-    "power": RobustKernel(_power_loss, _power_weight, 1.0, 0.0, 3.0, logarithmic=False),
-    "huber": RobustKernel(_huber_loss, _huber_weight, 5.0, 0.1, 1e4, logarithmic=True),
-    "cauchy": RobustKernel(_cauchy_loss, _cauchy_weight, 10.0, 0.1, 1e4, logarithmic=True),
-    "geman_mcclure": RobustKernel(_geman_mcclure_loss, _geman_mcclure_weight, 20.0, 0.1, 1e4, logarithmic=True),
-    "truncated": RobustKernel(_truncated_loss, _truncated_weight, 30.0, 0.1, 1e4, logarithmic=True),
+    "power": RobustKernel(
+        loss=_power_loss,
+        weight=lambda square, alpha: torch.exp(-0.5 * alpha * torch.log(square + POWER_FLOOR**2)),
+        default=1.0,
+        lower=0.0,
+        upper=3.0,
+        logarithmic=False,
+    ),
+    "huber": RobustKernel(
+        loss=_huber_loss,
+        weight=lambda square, scale: scale * square.maximum(scale * scale).rsqrt(),
+        default=5.0,
+    ),
+    "cauchy": RobustKernel(
+        loss=lambda square, scale: scale * scale * torch.log1p(square / (scale * scale)),
+        weight=lambda square, scale: 1.0 / (1.0 + square / (scale * scale)),
+        default=10.0,
+    ),
+    "geman_mcclure": RobustKernel(
+        loss=lambda square, scale: square / (1.0 + square / (scale * scale)),
+        weight=lambda square, scale: (1.0 + square / (scale * scale)) ** -2,
+        default=20.0,
+    ),
+    "truncated": RobustKernel(
+        loss=lambda square, scale: torch.minimum(square, scale * scale),
+        # Distributed training expects a gradient of every parameter: the zero term keeps the scale in the graph.
+        weight=lambda square, scale: (square < scale * scale).to(square.dtype) + 0.0 * scale,
+        default=30.0,
+    ),
 }
+
+
+class BoundedParameter(nn.Module):
+    """Values that are learned without bounds and used within bounds.
+
+    A sigmoid maps the raw parameter to ``[lower, upper]``, in log space if ``logarithmic``.
+
+    Args:
+        initial: initial value of each entry, within the bounds. Training never changes a value at a bound.
+        size: number of entries.
+        lower: lower bound.
+        upper: upper bound.
+        logarithmic: interpolate between the logarithms of the bounds, which must be positive.
+
+    Raises:
+        BaseError: when ``lower`` is not less than ``upper``, or ``initial`` is not within the bounds.
+
+    Example:
+        >>> BoundedParameter(1e-3, size=2, lower=1e-6, upper=1.0, logarithmic=True)()
+        tensor([0.0010, 0.0010], grad_fn=<ExpBackward0>)
+    """
+
+    def __init__(self, initial: float, *, size: int, lower: float, upper: float, logarithmic: bool = False) -> None:
+        super().__init__()
+        check_whole(1, size=size)
+        check_numbers(-math.inf, lower=lower, upper=upper)
+        KORNIA_CHECK(lower < upper, f"The bounds must rise, got {lower} and {upper}.")
+        KORNIA_CHECK(not logarithmic or lower > 0, f"The bounds of a logarithm must be positive, got {lower}.")
+        KORNIA_CHECK(lower <= initial <= upper, f"The initial value {initial} must lie between {lower} and {upper}.")
+        self._logarithmic = logarithmic
+        self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)
+        share = ((math.log(initial) if logarithmic else initial) - self._lower) / (self._upper - self._lower)
+        # The logit of a bound is infinite and could not be saved. The sigmoid of the clamped logit is still 0 or 1.
+        self.raw = nn.Parameter(torch.full((size,), share, dtype=torch.float32).logit().clamp(-_BOUND, _BOUND))
+
+    def forward(self) -> Tensor:
+        """Return the bounded values, shape ``(size,)``."""
+        value = self._lower + (self._upper - self._lower) * torch.sigmoid(self.raw)
+        return value.exp() if self._logarithmic else value

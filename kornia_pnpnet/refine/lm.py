@@ -14,13 +14,27 @@ from kornia_pnpnet.core.linalg import relative, solve_positive
 from kornia_pnpnet.core.performance import EAGER, Runner, are_few, per_problem, problems_last, repeat_problems
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.belief import LEAST_PROBABILITY, believe, has_enough
-from kornia_pnpnet.judge.evidence import AtPose, Evidence, Mixture, Votes, at_pose, evidence, updated
-from kornia_pnpnet.problem import Problem, Starts, State
-from kornia_pnpnet.refine.information import complete_noise, information, is_known, sq_standardised
-from kornia_pnpnet.refine.kernels import KERNELS, RobustKernel
-from kornia_pnpnet.refine.parameters import BoundedParameter
-from kornia_pnpnet.refine.residual import NormalEquations, Projection, lm_step, moved, normal_equations, project
+from kornia_pnpnet.judge.evidence import (
+    LEAST_PROBABILITY,
+    Evidence,
+    Mixture,
+    Votes,
+    at_pose,
+    believe,
+    evidence,
+    updated,
+)
+from kornia_pnpnet.problem import MIN_PAIRS, Noise, Problem, Starts, State
+from kornia_pnpnet.refine.kernels import KERNELS, BoundedParameter, RobustKernel
+from kornia_pnpnet.refine.residual import (
+    NormalEquations,
+    Projection,
+    information,
+    lm_step,
+    moved,
+    normal_equations,
+    project,
+)
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
@@ -43,17 +57,16 @@ _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
 
 class Plan(NamedTuple):
-    r"""The inputs of all iterations of a refinement.
+    r"""The inputs of all iterations of a refinement. Weights and sigmas have the shape :math:`(B, N)`.
 
     Attributes:
         problem: the problem with the caller's weights. Its noise is known for every pair or ``None``.
-        prior: weight of each pair without the robust weight, for the cost and the judge, :math:`(B, N)`: the caller's
-            weight, without iterations by residual times the initialiser's weight.
-        guided: the product of both weights, divided by the largest product, :math:`(B, N)`.
-        by_residual: the caller's weights divided by their mean, :math:`(B, N)`; without iterations by residual
-            ``guided``.
+        prior: weight of each pair without the robust weight, for the cost and the judge: the caller's weight, without
+            iterations by residual times the initialiser's weight.
+        guided: the product of both weights, divided by the largest product.
+        by_residual: the caller's weights divided by their mean; without iterations by residual ``guided``.
         state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second, ….
-        world_sigma: the caller's standard deviation of each point, 0 where unknown, :math:`(B, N)`.
+        world_sigma: the caller's standard deviation of each point, 0 where unknown.
         votes: votes of the pairs.
         hyperparameters: step, damping and shape of the kernel of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
@@ -75,10 +88,9 @@ class Plan(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What one iteration passes to the next: the states, whether the last equations could be solved, and more.
+    """What one iteration passes to the next: the states, and whether the last equations could be solved, bool (B,).
 
-    ``solved`` is bool of shape (B,). ``factor`` (B,) multiplies the damping. ``mixture`` is the distribution of the
-    residuals in iterations by residual.
+    ``factor`` (B,) multiplies the damping. ``mixture`` is the distribution of the residuals in iterations by residual.
     """
 
     state: State
@@ -102,8 +114,8 @@ class Refinement(NamedTuple):
         cost: robust loss of pairs and terms, divided by the number of pairs, shape :math:`(B,)`.
         ok: whether the pose is to be believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
-        probability: see :func:`~kornia_pnpnet.judge.belief.probability`, shape :math:`(B,)`.
-        sigma: :func:`~kornia_pnpnet.judge.belief.pose_sigma`, float64, shape :math:`(B,)`.
+        probability: see :func:`~kornia_pnpnet.judge.evidence.probability`, shape :math:`(B,)`.
+        sigma: :func:`~kornia_pnpnet.judge.evidence.pose_sigma`, float64, shape :math:`(B,)`.
         evidence: the evidence for the pose.
     """
 
@@ -126,13 +138,12 @@ class RobustWeightedLM(Configured):
     r"""Refine poses by ``m`` unrolled iterations of robust weighted Levenberg-Marquardt.
 
     Each iteration takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. The weight of a pair is the product of the
-    caller's weight, the initialiser's weight, and the robust weight of the pair's residual at the previous estimate.
-    Step :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel, :math:`\alpha` for ``power``)
-    are learned. A problem that cannot be solved keeps its pose, and is not ``ok``.
+    caller's weight, the initialiser's weight, and the robust weight of the residual at the previous estimate. Step
+    :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel) are learned. A problem that cannot
+    be solved keeps its pose, and is not ``ok``.
 
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
-    pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is then in standard
-    deviations, and the cost in their squares.
+    pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is in standard deviations.
 
     *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser, the others the
     pose of the lowest cost, with the kernel of the last iteration that refined all poses.
@@ -156,8 +167,8 @@ class RobustWeightedLM(Configured):
             the choice among several poses.
         learnable: whether the hyperparameters are trained.
         backward: ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the implicit function theorem to
-            the last state, in a memory that does not grow with ``m``. This gradient is exact if the iterations have
-            converged. Step, damping and initial poses have no implicit gradient.
+            the last state, in a memory that does not grow with ``m``. This gradient is exact at a minimum. Step,
+            damping and initial poses have no implicit gradient.
 
     Raises:
         BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
@@ -194,7 +205,6 @@ class RobustWeightedLM(Configured):
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
-        self.kernel: RobustKernel = KERNELS[kernel]
         self.m = m
         self.explored = 7 * m // 10
         self.by_residual = min(by_residual, m - self.explored)
@@ -209,6 +219,11 @@ class RobustWeightedLM(Configured):
         self.robustness = BoundedParameter(shape, size=size, **bounds, logarithmic=self.kernel.logarithmic)
         self.requires_grad_(learnable and m > 0)
 
+    @property
+    def kernel(self) -> RobustKernel:
+        """The robust kernel."""
+        return KERNELS[self.config["kernel"]]
+
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         r"""Step, damping and shape of the kernel of each iteration, like a tensor, :math:`(\max(m, 1),)` each."""
         count = max(self.m, 1)
@@ -216,9 +231,7 @@ class RobustWeightedLM(Configured):
         return step, damping, shape
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
-        """Copy the module with another number of iterations.
-
-        A smaller number keeps the hyperparameters of the first iterations, a larger number repeats those of the last.
+        """Copy the module with fewer iterations, or with more, which repeat the hyperparameters of the last.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
@@ -234,36 +247,31 @@ class RobustWeightedLM(Configured):
                 parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
         return refine
 
-    def forward(
-        self, problem: Problem, starts: Starts, *, m: int | None = None, more: int = 0, run: Runner = EAGER
-    ) -> Refinement:
-        """Refine poses.
+    def forward(self, problem: Problem, starts: Starts) -> Refinement:
+        """Refine the poses of ``starts`` in the frame of the problem.
 
         A pose is ``ok`` only if the equations of the last iteration could be solved, three pairs are in front of the
-        camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.belief.believe`).
-
-        Args:
-            problem: the problems.
-            starts: initial poses in the frame of the problem, and a weight factor for each pair.
-            m: number of iterations to run; ``None``: all iterations.
-            more: number of additional iterations with the hyperparameters of the last iteration.
-            run: calls each part of the refinement, compiled or uncompiled.
+        camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.evidence.believe`).
         """
-        plan, now = self.iterate(run(self.begin, problem, starts), m, more=more, run=run)
-        return run(self.judge, plan, now)
+        plan, now = self.iterate(self.begin(problem, starts))
+        return self.judge(plan, now)
 
     def begin(self, problem: Problem, starts: Starts) -> Plan:
-        """Run everything before the first iteration. See :meth:`forward` for the arguments."""
+        """Run everything before the first iteration."""
         each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
-        known = is_known(problem)
         given = problem.noise
-        problem = problems_last(problem._replace(noise=complete_noise(problem, starts)))
+        known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
+        if given is not None:  # the caller gave a sigma of any pixel or world point
+            known = torch.stack(given[:2]).isfinite().any(-1).any(0)[:, None]
+        problem = problems_last(problem._replace(noise=_complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
-        # A common factor of the weights does not change a step. The division prevents underflow of products of tiny
-        # weights.
+        # A common factor of the weights does not change a step. The division prevents underflow of their products.
         guided = by_residual = relative(prior, prior)
         if self.by_residual:
-            by_residual, prior = _relative_to_mean(problem.weights), problem.weights
+            prior = problem.weights
+            # Unlike the largest weight, the mean of the positive weights is differentiable.
+            mean = prior.sum(-1, keepdim=True) / (prior > 0).sum(-1, keepdim=True).clamp(min=1)
+            by_residual = prior / torch.where(mean > 0, mean, 1.0)
         poses = starts.poses
         # The memory layout of `problems_last` is (3, 3, S B) and (3, S B).
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
@@ -277,7 +285,14 @@ class RobustWeightedLM(Configured):
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[Plan, Progress]:
         """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
 
-        Returns the plan with the noise of the iterations by residual, and the last states. See :meth:`forward`.
+        Args:
+            plan: the result of :meth:`begin`.
+            m: number of iterations to run; ``None``: all iterations.
+            more: number of additional iterations with the hyperparameters of the last iteration.
+            run: calls each part of the refinement, compiled or uncompiled.
+
+        Returns:
+            The plan with the noise of the iterations by residual, and the last states.
         """
         m = self.m if m is None else min(m, self.m)
         each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
@@ -311,7 +326,8 @@ class RobustWeightedLM(Configured):
         step, damping = (per_problem(x, problem.img_scale) for x in (step, damping))
         seen = at_pose(now.state, problem, plan.votes)
         mixture = updated(now.mixture, seen, plan.votes, known)
-        equations = self._by_mixture(seen, problem, mixture)
+        robust = mixture.weights(seen) / mixture.variance
+        equations = self._equations(seen.projection, problem, robust, seen.precision)
         state, solved = lm_step(equations, now.state, seen.projection.focal, step, damping, additive=self.additive)
         return Progress(state, solved, now.factor, mixture)
 
@@ -334,7 +350,7 @@ class RobustWeightedLM(Configured):
         if odds is not None:
             probability = probability * odds.sigmoid()
             ok = ok & (probability >= LEAST_PROBABILITY)
-        in_front = has_enough(seen.projection, plan.prior)
+        in_front = (seen.projection.in_front & (plan.prior > 0)).sum(-1) >= MIN_PAIRS
         return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
@@ -366,8 +382,7 @@ class RobustWeightedLM(Configured):
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
-        # At a minimum, both costs differ only by rounding errors. The step is then accepted, because a rejected step
-        # has no gradient.
+        # At a minimum, both costs differ by rounding errors. The step is accepted: a rejected step has no gradient.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
@@ -382,10 +397,6 @@ class RobustWeightedLM(Configured):
         if problem.noise is None and problem.terms:  # without noise, sigma is one pixel of the caller
             robust = robust / problem.img_scale.square()[:, None]
         return projection, self._equations(projection, problem, robust, precision)
-
-    def _by_mixture(self, seen: AtPose, problem: Problem, mixture: Mixture) -> NormalEquations:
-        """The normal equations with the weights of the mixture."""
-        return self._equations(seen.projection, problem, mixture.weights(seen) / mixture.variance, seen.precision)
 
     def _equations(
         self, projection: Projection, problem: Problem, robust: Tensor, precision: Tensor | Symmetric2
@@ -409,9 +420,13 @@ class RobustWeightedLM(Configured):
 
     def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
         """Robust loss of pairs and terms, divided by the number of pairs that have a weight, shape (B,)."""
+        sq_residual, precision = information(projection, problem)
+        # The bound in square pixels times the mean precision of both coordinates is the bound in variances.
         most = (_MAX_RESIDUAL * projection.focal).square().reshape(-1, 1)
+        most = most * (precision if isinstance(precision, Tensor) else 0.5 * (precision.uu + precision.vv))
+        sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
         count = (problem.weights > 0).sum(-1).clamp(min=1)
-        total = (prior * self.kernel.loss(sq_standardised(projection, problem, most), shape)).sum(-1)
+        total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
         unit = problem.img_scale.square() if problem.noise is None else 1.0  # without noise, sigma is one pixel
         for term in problem.terms:
             total = total + unit * term.loss(projection.state)
@@ -421,15 +436,17 @@ class RobustWeightedLM(Configured):
         r"""Attach the gradient of the minimiser to a converged state, by the implicit function theorem.
 
         At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
-        The code adds a Newton step that has this gradient and the value 0, with the Gauss-Newton matrix if the Newton
-        matrix is not positive definite. A second step makes second derivatives exact. Covariances rotate with the pose,
-        so that the matrix is not exactly symmetric: a third step then removes most of the error.
+        Each added Newton step has this gradient and the value 0, with the Gauss-Newton matrix if the Newton matrix is
+        not positive definite. The second step makes second derivatives exact. With covariances the matrix is not
+        exactly symmetric, because they rotate with the pose; the third step removes most of this error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
             if mixture is None:
                 return self._by_kernel(at, problem, shape)[1]
-            return self._by_mixture(at_pose(at, problem, plan.votes), problem, mixture)
+            seen = at_pose(at, problem, plan.votes)
+            robust = mixture.weights(seen) / mixture.variance
+            return self._equations(seen.projection, problem, robust, seen.precision)
 
         mixture, state = now.mixture, now.state
         problem = plan.problem._replace(weights=plan.guided if mixture is None else plan.by_residual)
@@ -460,7 +477,13 @@ def taken(tree: _T, index: Tensor) -> _T:
     return map_tensors(select, tree)
 
 
-def _relative_to_mean(weights: Tensor) -> Tensor:
-    """Divide weights by the mean of the positive weights. Unlike the largest weight, the mean is differentiable."""
-    mean = weights.sum(-1, keepdim=True) / (weights > 0).sum(-1, keepdim=True).clamp(min=1)
-    return weights / torch.where(mean > 0, mean, 1.0)
+def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
+    """The noise of every pair: sigmas of the initialiser, else of the caller, and the caller's covariances.
+
+    If the initialiser gave no noise, unknown sigmas become 0. ``None``: neither gave noise.
+    """
+    given = starts.noise if problem.noise is None else problem.noise
+    if given is None:
+        return None
+    noise = map_tensors(lambda x: x.nan_to_num(0.0), given) if starts.noise is None else starts.noise
+    return noise._replace(img_cov=given.img_cov, world_cov=given.world_cov).bounded(problem.focal)

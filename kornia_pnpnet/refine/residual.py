@@ -1,12 +1,12 @@
-"""The reprojection residual: projection, Jacobian, normal equations, and the motion of a state along a tangent vector.
+"""The reprojection residual: projection, noise, normal equations, and the motion of a state along a tangent vector.
 
 The pose maps points by ``x_cam = R x_world + t``. The camera looks along +z. Pixels belong to a camera with a single
 focal length and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its
 distance. The test does not depend on the unit of the world.
 
-The dimensions of arrays in this module are coordinates, pairs and problems, in this order, so that operations run over
-long rows of memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection
-(``tests/test_kornia_contract.py``), but take three times as long for 1000 problems of 9 pairs.
+Dimensions of arrays are coordinates, pairs and problems, in this order, so that operations run over long rows of
+memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection, but take three times as long
+for 1000 problems of 9 pairs.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ __all__ = [
     "NormalEquations",
     "Projection",
     "covariance_at",
+    "information",
     "lm_step",
     "moved",
     "normal_equations",
@@ -40,6 +41,7 @@ __all__ = [
     "project",
     "retract",
     "rotation_angle",
+    "tangent",
 ]
 
 #: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. Otherwise ``|x / z|`` is below 1000.
@@ -47,6 +49,8 @@ MIN_DEPTH_RATIO = 1e-3
 # Largest changes in one step: of the logarithm of the focal length, and of a coefficient of radial distortion. The
 # exponential of a larger change could overflow.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
+# Lower bound of 1 + tr(R), the denominator of the tangent vector of a rotation R. It is 0 at a half turn.
+_LEAST_DENOMINATOR = 1e-4
 
 # The entries of u and v in one column of the Jacobian. An entry that is the same for all pairs is a Python number.
 _Column: TypeAlias = tuple[Any, Any]
@@ -108,8 +112,7 @@ class NormalEquations(NamedTuple):
 def project(state: State, problem: Problem) -> Projection:
     """Project the points of a problem, and subtract their pixels: the residual is :math:`f d (p, q) - b`.
 
-    The depth of points behind the camera is replaced *before* the division, so that neither values nor gradients can
-    overflow.
+    The depth of points behind the camera is replaced before the division, so that values and gradients are finite.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[1.0, 2.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -148,14 +151,12 @@ def project(state: State, problem: Problem) -> Projection:
 
 
 def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
-    r"""Variance of a pixel coordinate, from the noise of the pixel and of the world point.
+    r"""Variance of a pixel coordinate :math:`(B, N)`, from the noise of the pixel and of the world point.
 
     A shift of the point by :math:`d` in the camera's axes moves its pixel by :math:`J d` with
     :math:`J = \tfrac fz [I_2 \mid -(p, q)^\top]`. The mean of the variances of both coordinates is
-    :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 \, \mathrm{tr}(J J^\top) / 2` with
-    :math:`\mathrm{tr}(J J^\top) = (f/z)^2 (2 + p^2 + q^2)`.
-
-    The result has the shape :math:`(B, N)`. A point behind the camera has only the noise of its pixel.
+    :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2 (f/z)^2 (1 + (p^2 + q^2) / 2)`. A point behind the camera has
+    only the noise of its pixel.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[0.0, 0.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -170,7 +171,7 @@ def pixel_variance(projection: Projection, noise: Noise) -> Tensor:
 
 
 def pixel_covariance(projection: Projection, problem: Problem, noise: Noise) -> Symmetric2:
-    """Covariance of each pixel, entries (B, N). A point behind the camera has only the noise of its pixel."""
+    """Covariance of each pixel, entries (B, N), see :func:`pixel_variance`."""
     rotation = projection.state.pose.rotation[:, None]
     if problem.rig is not None:
         rotation = problem.rig.rotation @ rotation
@@ -205,6 +206,23 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
     return Symmetric2(uu + noise.img_cov.uu, uv + noise.img_cov.uv, vv + noise.img_cov.vv)
 
 
+def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
+    """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
+
+    With noise, which must be known for every pair, squared residuals are in variances of their pixel, and the
+    information is the inverse variance of each pixel, (B, N), or its inverse covariance if the noise has covariances.
+    Without noise, squared residuals are in square pixels, and the information is 1, (1, 1).
+    """
+    noise = problem.noise
+    if noise is None:
+        return projection.sq_residual, problem.weights.new_ones(1, 1)
+    if not noise.covariances:
+        precision = pixel_variance(projection, noise).reciprocal()
+        return projection.sq_residual * precision, precision
+    inverse = pixel_covariance(projection, problem, noise).inverse()
+    return inverse.form(*projection.residual.mT.unbind()), inverse
+
+
 def normal_equations(
     projection: Projection, problem: Problem, weights: Tensor | Symmetric2, *, relative: bool = False
 ) -> NormalEquations:
@@ -213,8 +231,8 @@ def normal_equations(
     Args:
         projection: the problem projected at the state.
         problem: the problem.
-        weights: weight of each pair, :math:`(B, N)`, or 2x2 weight matrix of each pair with entries :math:`(B, N)`, in
-            inverse square pixels. Points behind the camera do not count.
+        weights: weight of each pair, :math:`(B, N)`, or its weight matrix, entries :math:`(B, N)`, in inverse square
+            pixels. Points behind the camera do not count.
         relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
             underflow. The divisor has no gradient.
     """
@@ -379,16 +397,12 @@ def moved(state: State, delta: Tensor) -> State:
     r"""Move a state along a tangent vector :math:`(\omega, v, c)`, shape :math:`(6 + K, B)`.
 
     The pose becomes :math:`(\mathrm{cay}(\omega) R,\; t + v)`. With a centred world, a rotation leaves the centroid in
-    place, so that rotation and translation stay well separated in the normal equations at any distance of the points.
-
-    The Cayley transform
+    place, so that rotation and translation are well separated in the normal equations. The Cayley transform
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)` agrees with the
-    exponential map to second order, and needs neither trigonometry nor a branch at 0. The angle of rotation is
-    :math:`2 \arctan(|\omega|/2)`.
+    exponential map to second order, and needs no trigonometry. Its angle is :math:`2 \arctan(|\omega|/2)`.
 
     The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
-    zoom, so that the origin keeps its pixel and its scale. Otherwise a larger focal length and a smaller distance of
-    the camera would move the pixels of distant points in the same way.
+    zoom, so that the origin keeps its pixel and its scale.
     """
     turn, rotation = delta[:3, None], state.pose.rotation.permute(1, 2, 0)
     size = turn.square().sum(0) + 4.0
@@ -424,16 +438,21 @@ def retract(pose: Pose, delta: Tensor) -> Pose:
     return moved(State.of(pose), delta.mT).pose
 
 
+def tangent(rotation: Tensor) -> Tensor:
+    r"""The vector :math:`\omega` with :math:`\mathrm{cay}(\omega) = R`, :math:`(*, 3)`, bounded near half turns."""
+    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    return 2.0 * So3.vee(rotation - rotation.mT) / (1.0 + trace).clamp(min=_LEAST_DENOMINATOR)
+
+
 def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
     r"""Angle between two rotations.
 
-    With :math:`D = A B^\top`, the angle is
-    :math:`\mathrm{atan2}(\|\tfrac12 \mathrm{vee}(D - D^\top)\|, \tfrac12(\mathrm{tr} D - 1))`, accurate for
-    small angles, unlike the arccosine. The angle is not differentiable at 0: train with :mod:`kornia_pnpnet.losses`.
+    The arctangent is accurate for small angles, unlike the arccosine. The angle is not differentiable at 0: train with
+    :mod:`kornia_pnpnet.losses`.
 
     Args:
-        rotation_a: :math:`A`, shape :math:`(*, 3, 3)`.
-        rotation_b: :math:`B`, shape :math:`(*, 3, 3)`.
+        rotation_a: shape :math:`(*, 3, 3)`.
+        rotation_b: shape :math:`(*, 3, 3)`.
 
     Returns:
         The angle in radians, in [0, π], shape :math:`(*)`.

@@ -16,8 +16,8 @@ from torch.nn import functional
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_form, check_positive, check_shapes, common_dtype
 from kornia_pnpnet.core.performance import compiling, full_precision
 from kornia_pnpnet.problem import Linear, State
-from kornia_pnpnet.refine.residual import NormalEquations
-from kornia_pnpnet.result import Pose, PosePrior
+from kornia_pnpnet.refine.residual import NormalEquations, tangent
+from kornia_pnpnet.result import Pose, PosePrior, sound_pose
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
@@ -28,8 +28,6 @@ _KNOWN = 1e-5
 _LARGEST_RATIO = 100.0
 # Standard deviations. Default scale of the robust kernel.
 _SCALE = 3.0
-# Lower bound of 1 + tr(R), the denominator of the tangent vector of the rotation R from a pose to the prior.
-_LEAST_DENOMINATOR = 1e-4
 # Prior standard deviation of a coefficient of radial distortion. The prior keeps a coefficient close to 0 if the pairs
 # do not determine the coefficient.
 _RADIAL = 0.15
@@ -62,13 +60,13 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
         tensor([[10000.,     0., 10000.,     0.,     0.,     0.]])
     """
     check_form(["*", "3"], world_down=world_down)
-    tensors = {"world_down": world_down, "cam_down": cam_down}
     shapes: Shapes = {"cam_down": (cam_down, tuple(world_down.shape))}
     if isinstance(sigma, Tensor):
-        tensors["sigma"], shapes["sigma"] = sigma, (sigma, tuple(world_down.shape[:-1]) if sigma.ndim else ())
+        shapes["sigma"] = sigma, tuple(world_down.shape[:-1]) if sigma.ndim else ()
     else:
         check_positive(or_infinite=True, sigma=sigma)
     check_shapes(shapes)
+    tensors = {"world_down": world_down, **{name: x for name, (x, _) in shapes.items()}}
     check_devices(tensors, world_down, "world_down")
     dtype = common_dtype(tensors)
     a, b = (functional.normalize(x.to(dtype), dim=-1) for x in (world_down, cam_down))
@@ -159,24 +157,29 @@ class PoseTerm(NamedTuple):
     def of(cls, prior: PosePrior, centroid: Tensor, size: Tensor) -> tuple[PoseTerm, Tensor]:
         """Express a prior in the frame of a problem, with the ``centroid`` and ``size`` of its ``Frame``.
 
-        Also returns whether the prior is usable, bool (B,). The information of an unusable prior becomes 0.
+        Also returns whether the prior is usable, bool (B,): all numbers are in range, and the information is positive
+        semi-definite. The information of an unusable prior becomes 0.
         """
         lengths = torch.cat((torch.ones_like(centroid), size[:, None].expand(-1, 3)), -1)
-        usable = _is_usable(prior, lengths)
-        eye = torch.eye(3, dtype=centroid.dtype, device=centroid.device)
-        rotation = torch.where(usable[:, None, None], prior.pose.rotation, eye)
-        translation = torch.where(usable[:, None], prior.pose.translation, 0.0)
+        information = prior.information * lengths[:, :, None] * lengths[:, None]
+        limits = torch.finfo(size.dtype)
+        limit = limits.max**0.25
+        numbers = [prior.pose.rotation, prior.pose.translation / size[:, None], information]
+        usable = torch.stack([(x.detach().flatten(1).abs() < limit).all(1) for x in numbers]).all(0)
+        if prior.scale is not None:
+            usable = usable & (prior.scale > 1.0 / limit)
+        known, symmetric = _correlations(torch.where(usable[:, None, None], prior.information, 0.0))
+        usable = usable & symmetric & (known[:, 0] > -1e3 * limits.eps)
+        rank = (usable[:, None] & (known > _KNOWN)).sum(-1).to(size)
         information = torch.where(usable[:, None, None], prior.information, 0.0)
-        offset = centroid / size[:, None]
-        moved = translation / size[:, None] + (rotation * offset[:, None]).sum(-1)
         information = information * lengths[:, :, None] * lengths[:, None]
-        rank = (_correlations(information)[0] > _KNOWN).sum(-1).to(centroid)
+        rotation, translation = sound_pose(prior.pose, usable)
+        offset = centroid / size[:, None]
+        pose = Pose(rotation, translation / size[:, None] + (rotation * offset[:, None]).sum(-1))
         widest = torch.full_like(size, _SCALE) if prior.scale is None else torch.where(usable, prior.scale, _SCALE)
         widest = torch.where(widest.isinf(), widest.detach(), widest)  # an infinite scale has no gradient
         sq_scale = 0.5 * widest.square() * rank.clamp(min=1.0)
-        return cls(
-            Pose(rotation, moved), information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank
-        ), usable
+        return cls(pose, information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank), usable
 
     def errors(self, pose: Pose) -> tuple[Tensor, Tensor]:
         """The tangent vector of ``retract`` from poses to the prior's pose, (B, 6), and its squared Mahalanobis length.
@@ -194,11 +197,9 @@ class PoseTerm(NamedTuple):
         cosine, sine = torch.where(sound, along / length, 1.0), torch.where(sound, around / length, 0.0)
         axis = So3.hat(free.flatten(0, -2)).unflatten(0, free.shape[:-1])
         turn = turn + sine[..., None, None] * (axis @ turn) + (1.0 - cosine)[..., None, None] * (axis @ (axis @ turn))
-        trace = turn.diagonal(dim1=-2, dim2=-1).sum(-1)
-        omega = 2.0 * So3.vee(turn - turn.mT) / (1.0 + trace).clamp(min=_LEAST_DENOMINATOR)[..., None]
         shift = self.pose.translation - pose.translation
         shift = shift + ((pose.rotation - self.pose.rotation) * self.offset[..., None, :]).sum(-1)
-        error = torch.cat((omega, shift), -1)
+        error = torch.cat((tangent(turn), shift), -1)
         return error, ((self.information * error[..., None, :]).sum(-1) * error).sum(-1)
 
     def linearise(self, state: State) -> Linear:
@@ -233,18 +234,6 @@ class PoseTerm(NamedTuple):
         """See :class:`~kornia_pnpnet.problem.Term`. The penalty is at most half of ``rank``."""
         scale = torch.where(self.sq_scale.isinf(), _SCALE**2 * self.rank.clamp(min=1.0), self.sq_scale)
         return -0.5 * self.rank * torch.expm1(-self.errors(pose)[1] / scale)
-
-
-def _is_usable(prior: PosePrior, lengths: Tensor) -> Tensor:
-    """Whether all numbers are in range and the information is positive semi-definite, bool (B,)."""
-    information = prior.information * lengths[:, :, None] * lengths[:, None]
-    numbers = [prior.pose.rotation, prior.pose.translation / lengths[:, 3:], information]
-    limit = torch.finfo(prior.information.dtype).max ** 0.25
-    fine = torch.stack([(x.detach().flatten(1).abs() < limit).all(1) for x in numbers]).all(0)
-    if prior.scale is not None:
-        fine = fine & (prior.scale > 1.0 / limit)
-    known, symmetric = _correlations(torch.where(fine[:, None, None], prior.information.detach(), 0.0))
-    return fine & symmetric & (known[:, 0] > -1e3 * torch.finfo(prior.information.dtype).eps)
 
 
 def _open_axis(information: Tensor) -> Tensor:
