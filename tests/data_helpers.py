@@ -43,12 +43,6 @@ def draw(n=9, batch=COUNT, **options):
     return SyntheticProblems(n=n, batch_size=batch, seed=7, dtype=torch.float64, **options).batch(0)
 
 
-def reprojection(problems):
-    """Projections under the true pose less the pixels, (B, N, 2)."""
-    projected = problems.true_cam_points @ problems.intrinsics.mT
-    return projected[..., :2] / projected[..., 2:] - problems.img_points
-
-
 def same(one, two):
     """Whether two trees hold the same numbers, NaN included."""
     pairs = zip(iter_tensors(one), iter_tensors(two), strict=True)

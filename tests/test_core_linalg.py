@@ -1,12 +1,11 @@
 """Linear algebra of small matrices, beside LAPACK's."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from kornia_pnpnet.core import linalg
-from kornia_pnpnet.core.linalg import align, eigenvectors, nearest_rotation, solve_leading, solve_positive
+from kornia_pnpnet.core.linalg import eigenvectors, nearest_rotation, solve_leading, solve_positive
+from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, are_semi_definite, equivalent_sigma
 from kornia_pnpnet.refine.residual import rotation_angle
 
 
@@ -70,22 +69,6 @@ def test_gradcheck_of_the_nearest_rotation(generator):
         assert torch.autograd.gradgradcheck(lambda m: nearest_rotation(m)[0], inputs)
 
 
-def test_align_finds_a_similarity(random_rotations, generator):
-    """With weights of 0 for outliers; without noise it is exact."""
-    source = torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
-    rotation, shift = random_rotations(7), torch.randn(7, 1, 3, generator=generator, dtype=torch.float64)
-    target = 2.5 * source @ rotation.mT + shift
-    target[:, 0] += 100.0
-    weights = torch.rand(7, 9, generator=generator, dtype=torch.float64)
-    weights[:, 0] = 0.0
-    found, translation, scale = align(source, target, weights)
-    torch.testing.assert_close(found, rotation)
-    torch.testing.assert_close(scale, torch.full((7,), 2.5, dtype=torch.float64))
-    share = (weights / weights.sum(1, keepdim=True))[..., None]
-    means = [(share * x).sum(1) for x in (source, target)]
-    torch.testing.assert_close(translation, means[1] - (rotation @ means[0][..., None])[..., 0])
-
-
 # --- systems and eigenvectors ---------------------------------------------------------------------------------------
 
 
@@ -96,19 +79,6 @@ def systems(generator):
     matrix, rhs = root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
     rows = [list(row[: i + 1].unbind(0)) for i, row in enumerate(matrix.permute(1, 2, 0).unbind(0))]
     return matrix, rhs, rows
-
-
-def test_leading_blocks_are_solved(systems):
-    matrix, rhs, rows = systems
-    sizes = (1, 3, 6)
-    for size, solution in zip(sizes, solve_leading(rows, rhs.mT, sizes), strict=True):
-        expected = torch.linalg.solve(matrix[:, :size, :size], rhs[:, :size])
-        # The ridge is 16 roundings of the diagonal.
-        torch.testing.assert_close(torch.stack(solution, -1), expected, rtol=1e-10, atol=1e-10)
-    nan = torch.full_like(rhs[:, 0], torch.nan)
-    padded = [[*row, *[nan] * (5 - i)] for i, row in enumerate(rows)]  # above the diagonal nothing is read
-    again = solve_leading(padded, rhs.mT, (6,))[0]
-    assert torch.equal(torch.stack(again), torch.stack(solution))
 
 
 def test_a_singular_system_in_its_range_has_a_finite_solution():
@@ -164,3 +134,54 @@ def test_gradients_are_finite_for_any_size_of_the_matrix(count):
         solution, _ = solve_positive(matrix, torch.full((6, count), size), torch.tensor(0.0))
         (0.0 * solution).sum().backward()
         assert matrix.grad.isfinite().all()
+
+
+# --- symmetric matrices by their entries ------------------------------------------------------------------------------
+
+KINDS = {2: Symmetric2, 3: Symmetric3}
+
+
+def matrices(size, count=200, eigenvalues=None):
+    generator = torch.Generator().manual_seed(size)
+    turn = torch.linalg.qr(torch.randn(count, size, size, generator=generator, dtype=torch.float64)).Q
+    values = 10.0 ** (4.0 * torch.rand(count, size, generator=generator, dtype=torch.float64) - 2.0)
+    values = values if eigenvalues is None else torch.tensor(eigenvalues, dtype=torch.float64).expand(count, size)
+    return (turn * values[:, None]) @ turn.mT
+
+
+def full(symmetric):
+    size = range(2 if len(symmetric) == 3 else 3)
+    upper = dict(zip([(i, j) for i in size for j in size[i:]], symmetric, strict=True))
+    return torch.stack([torch.stack([upper[min(i, j), max(i, j)] for j in size], -1) for i in size], -2)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [2, 3])
+def test_semi_definite_is_told_up_to_rounding(size, dtype):
+    for smallest, expected in ((0.0, True), (1e-3, True), (-1e-3, False), (torch.nan, False), (torch.inf, False)):
+        matrix = matrices(size, eigenvalues=[1.0, 1.0, smallest][-size:]).to(dtype)
+        assert (are_semi_definite(KINDS[size].of(matrix)) == expected).all(), smallest
+        assert not are_semi_definite(KINDS[size].of(-matrix)).any()
+    assert are_semi_definite(KINDS[size].of(torch.zeros(1, size, size, dtype=dtype))).all()
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_the_equivalent_sigma_has_the_same_trace(size):
+    matrix = matrices(size)
+    sigma = equivalent_sigma(KINDS[size].of(matrix))
+    torch.testing.assert_close(size * sigma.square(), matrix.diagonal(dim1=1, dim2=2).sum(-1))
+    zero = torch.zeros(1, size, size, requires_grad=True)
+    equivalent_sigma(KINDS[size].of(zero)).sum().backward()
+    assert (zero.grad == 0).all()
+    assert equivalent_sigma(KINDS[size].of(torch.full((1, size, size), torch.nan))).isnan().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_eigenvalues_are_raised(dtype):
+    matrix = matrices(2, eigenvalues=[4.0, 0.0]).to(dtype)
+    raised = Symmetric2.of(matrix).at_least(1.0)
+    values = torch.linalg.eigvalsh(full(raised))
+    torch.testing.assert_close(values, torch.tensor([1.0, 5.0], dtype=dtype).expand(200, 2), rtol=1e-5, atol=1e-5)
+    same = Symmetric2.of(matrices(2, eigenvalues=[4.0, 2.0]).to(dtype))
+    torch.testing.assert_close(full(same.at_least(1.0)), full(same), rtol=0, atol=0)
+    assert (Symmetric2.of(matrix).at_least(0.0).determinant > 0).all()

@@ -1,14 +1,12 @@
 """The evidence for a pose: which noise the pairs show, which pairs are inliers, and whether the pose is believed."""
 
-from __future__ import annotations
-
 import json
 import math
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from doubtful import doubtful
 from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
@@ -20,10 +18,6 @@ from kornia_pnpnet.problem import Noise, Problem, State
 from kornia_pnpnet.refine.residual import project
 
 ROOT = Path(__file__).parents[1]
-sys.path.append(str(ROOT / "docs" / "results"))
-
-from doubtful import doubtful  # noqa: E402
-
 SOLVERS = ("pnpnet-set", "p3p-ransac", "epnp-lm", "pnpnet-n20")
 #: Largest share of the far-off poses that are ``ok``, by kind, and where it is larger: 20 pairs of a wrong convention
 #: often fit an incorrect pose.

@@ -1,7 +1,5 @@
 """Laws of RANSAC: how samples are drawn and poses scored, and that the pose and its inliers are found."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

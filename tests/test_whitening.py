@@ -1,7 +1,5 @@
 """Covariances of pixels and world points: whitening by them, from the user's argument to pose, weights and gradient."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

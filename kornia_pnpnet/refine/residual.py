@@ -6,7 +6,7 @@ distance. The test does not depend on the unit of the world.
 
 The dimensions of arrays in this module are coordinates, pairs and problems, in this order, so that operations run over
 long rows of memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection
-(``tests/test_kornia_contract.py``), but take three times as long for 1000 problems of 9 pairs.
+(``tests/test_kornia_fit.py``), but take three times as long for 1000 problems of 9 pairs.
 """
 
 from __future__ import annotations
