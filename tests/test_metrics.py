@@ -15,13 +15,14 @@ from kornia_pnpnet.metrics import PoseErrors, reliability
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 9e-4, 1.1e-3, 1.0, math.pi / 2, math.pi - 1e-7, math.pi])
 def test_errors_of_a_known_motion(angle, random_rotations):
     base = random_rotations(50, seed=1)
-    estimate = Pose(
-        random_rotations(50, angle=angle, seed=2) @ base, torch.tensor([[1.0, 2, 3]]).double().expand(50, 3)
-    )
-    errors = pose_errors(estimate, Pose(base, torch.tensor([[1.0, 5, 7]]).double().expand(50, 3)))
+    here, there = torch.tensor([[1.0, 2, 3], [1, 5, 7]], dtype=torch.float64).unsqueeze(1).expand(2, 50, 3)
+    estimate, truth = Pose(random_rotations(50, angle=angle, seed=2) @ base, here), Pose(base, there)
+    errors = pose_errors(estimate, truth)
     expected = torch.full((50,), math.degrees(angle), dtype=torch.float64)
     torch.testing.assert_close(errors.rotation_error_deg, expected, rtol=0, atol=1e-12)
     torch.testing.assert_close(errors.translation_error, torch.full((50,), 5.0).double())
+    single = pose_errors(*(Pose(*(x.float() for x in pose)) for pose in (estimate, truth))).rotation_error_deg
+    torch.testing.assert_close(single, expected.float(), rtol=1e-2, atol=1e-4)  # small angles are kept, too
 
 
 def test_success_needs_both_and_is_strict():

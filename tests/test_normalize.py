@@ -7,9 +7,10 @@ import torch
 from kornia.geometry.conversions import denormalize_points_with_intrinsics
 from kornia.geometry.linalg import transform_points
 
-from kornia_pnpnet import Normalize
+from kornia_pnpnet import Normalize, Pose
 from kornia_pnpnet.frame import F_CONST
-from kornia_pnpnet.problem import State
+from kornia_pnpnet.problem import Starts, State
+from kornia_pnpnet.propose.views import VIEWS, from_views
 from kornia_pnpnet.refine.residual import project
 
 DOUBLE = torch.float64
@@ -103,3 +104,34 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
     for shape, offset, unit in itertools.product(shapes, (0.0, 10.0), (1e-3, 1.0, 1e3)):
         points = unit * ((world * torch.tensor(shape, dtype=DOUBLE)) @ turn.mT + offset)
         assert Normalize()(points.to(dtype), pixels, K)[1].valid.all(), (shape, offset, unit)
+
+
+# --- views ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [True, False])
+def test_mirrors_show_the_same_problems_and_are_undone(order, make_problems):
+    """Every view has a pose that explains its pixels exactly, and undoing the view gives the true one."""
+    p = make_problems(noise=False)
+    problem, frame = Normalize(order=order)(*p[:3])
+    true, count = frame.apply(p.pose), len(VIEWS)
+    poses = []
+    for swap, reverse_x, reverse_y in VIEWS:
+        mirror = torch.diag(torch.tensor([1.0 - 2 * reverse_x, 1.0 - 2 * reverse_y, 1.0], dtype=DOUBLE))
+        mirror = mirror[:, [1, 0, 2]] if swap else mirror
+        poses.append((mirror @ true.rotation @ mirror.mT, true.translation @ mirror.mT))
+    stacked = Pose(*(torch.cat(entries) for entries in zip(*poses, strict=True)))
+
+    def knowing(seen):
+        points = seen.world_points.unflatten(0, (count, 7))
+        assert torch.equal(points[0], problem.world_points)  # the problem itself; no two views are alike
+        assert not any(torch.equal(points[i], points[j]) for i in range(count) for j in range(i))
+        assert residuals(stacked, seen).abs().max() < 1e-6
+        if order:
+            assert (seen.img_points[:, 1:, 0] >= seen.img_points[:, :-1, 0]).all()
+        return Starts(stacked, seen.weights)
+
+    starts = from_views(knowing, problem, count, order)
+    assert len(starts.poses) == count
+    for pose in starts.poses:
+        torch.testing.assert_close(pose, true)
