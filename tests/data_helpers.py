@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from kornia_pnpnet.core.trees import iter_tensors
@@ -47,6 +48,20 @@ def same(one, two):
     """Whether two trees hold the same numbers, NaN included."""
     pairs = zip(iter_tensors(one), iter_tensors(two), strict=True)
     return all(a.dtype == b.dtype and torch.allclose(a, b, rtol=0, atol=0, equal_nan=True) for a, b in pairs)
+
+
+def arrays(problems):
+    """The arrays of a shard."""
+    names = "world_points", "img_points", "intrinsics"
+    return {name: getattr(problems, name).numpy() for name in names}
+
+
+def table(problems, **more):
+    """The table of a shard, with more columns."""
+    from kornia_pnpnet.arrow import list_column
+
+    columns = {name: list_column(np.asarray(array)) for name, array in (arrays(problems) | more).items()}
+    return pytest.importorskip("pyarrow").table(columns)
 
 
 def pose_of(i):

@@ -13,9 +13,7 @@ from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.judge.belief import LAW, LEAST_PROBABILITY
 from kornia_pnpnet.judge.evidence import Votes, at_pose, copies, evidence
-from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Noise, Problem, State
-from kornia_pnpnet.refine.residual import project
 
 ROOT = Path(__file__).parents[1]
 SOLVERS = ("pnpnet-set", "p3p-ransac", "epnp-lm", "pnpnet-n20")
@@ -79,20 +77,6 @@ def test_copies_share_one_vote():
     votes = Votes.of(twice, twice.weights[:, :1] < 0).pairs
     torch.testing.assert_close(votes.sum(1), torch.full((50,), 12.0, dtype=torch.float64))
     torch.testing.assert_close(found(twice, pose).log_ratio, found(problem, pose).log_ratio, rtol=0.1, atol=2.0)
-
-
-def test_an_inlier_is_within_the_thresholds_of_pixel_and_point():
-    """At depth 4 and focal length 100 a point that is off by 0.2 is off by 5 pixels."""
-    problem = Problem.of(
-        torch.tensor([[[0.0, 0.0, 4.0], [0.2, 0.0, 4.0], [0.48, 0.0, 4.0], [0.0, 0.0, -4.0]]]),
-        torch.zeros(1, 4, 2),
-        100.0,
-    )
-    projection = project(State.of(Pose(torch.eye(3)[None], torch.zeros(1, 3))), problem)
-    judged = judge(projection, problem, Thresholds(torch.tensor([[10.0]]), torch.tensor([[0.2]])))
-    torch.testing.assert_close(judged.errors[0, :3], torch.tensor([0.0, 25.0, 144.0]) / 125.0)
-    torch.testing.assert_close(judged.weights, torch.tensor([[0.8, 0.8, 0.0, 0.0]]))
-    assert judged.inliers.tolist() == [2]
 
 
 # --- the results ------------------------------------------------------------------------------------------------------
