@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from strategies import ANY, COUNTS, ERRORS, WORD, Seen, finite, many, options
 
 from kornia_pnpnet import create_solver, list_solvers
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import SyntheticProblems
 
 
@@ -27,6 +28,14 @@ def test_solvers_of_any_name_and_options():
 
     run()
     made.both()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac"])
+def test_solvers_stay_where_their_inputs_are(name, make_problems):
+    p = make_problems(dtype=torch.float32).map(lambda x: x.cuda())
+    result, starts = create_solver(name).cuda().with_starts(*p[:3])
+    assert {x.device.type for x in iter_tensors((result, starts.weights))} == {"cuda"}
 
 
 # --- torch.func -------------------------------------------------------------------------------------------------------
