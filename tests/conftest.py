@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,11 @@ from kornia_pnpnet.refine.residual import retract
 
 if TYPE_CHECKING:
     from kornia_pnpnet.training import FitReport
+
+
+#: Scripts that are no part of the package and import each other.
+SCRIPTS = "benchmarks", "docs/results", "docs/examples"
+sys.path += [str(Path(__file__).resolve().parents[1] / folder) for folder in SCRIPTS]
 
 
 @pytest.fixture(scope="session", autouse=True)

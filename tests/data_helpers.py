@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from kornia_pnpnet.core.trees import iter_tensors
@@ -43,16 +44,24 @@ def draw(n=9, batch=COUNT, **options):
     return SyntheticProblems(n=n, batch_size=batch, seed=7, dtype=torch.float64, **options).batch(0)
 
 
-def reprojection(problems):
-    """Projections under the true pose less the pixels, (B, N, 2)."""
-    projected = problems.true_cam_points @ problems.intrinsics.mT
-    return projected[..., :2] / projected[..., 2:] - problems.img_points
-
-
 def same(one, two):
     """Whether two trees hold the same numbers, NaN included."""
     pairs = zip(iter_tensors(one), iter_tensors(two), strict=True)
     return all(a.dtype == b.dtype and torch.allclose(a, b, rtol=0, atol=0, equal_nan=True) for a, b in pairs)
+
+
+def arrays(problems):
+    """The arrays of a shard."""
+    names = "world_points", "img_points", "intrinsics"
+    return {name: getattr(problems, name).numpy() for name in names}
+
+
+def table(problems, **more):
+    """The table of a shard, with more columns."""
+    from kornia_pnpnet.arrow import list_column
+
+    columns = {name: list_column(np.asarray(array)) for name, array in (arrays(problems) | more).items()}
+    return pytest.importorskip("pyarrow").table(columns)
 
 
 def pose_of(i):

@@ -37,8 +37,9 @@ def rate(result: Any, problems: Problems, **limits: float) -> float:
     return success(pose_errors(result.pose, problems.pose), **limits).double().mean().item()
 
 
-def reprojection_errors(problems: Problems, pose: Pose) -> Tensor:
-    """Pixels of the points under poses minus those of the problems, (B, N, 2)."""
+def reprojection_errors(problems: Problems, pose: Pose | None = None) -> Tensor:
+    """Pixels of the points under poses, or under the true ones, minus those of the problems, (B, N, 2)."""
+    pose = problems.pose if pose is None else pose
     seen = (problems.world_points @ pose.rotation.mT + pose.translation[:, None]) @ problems.intrinsics.mT
     return seen[..., :2] / seen[..., 2:] - problems.img_points
 

@@ -5,12 +5,13 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from data_helpers import table as table_of
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 
 from kornia_pnpnet import create_solver
 
 pa = pytest.importorskip("pyarrow")
-from kornia_pnpnet.arrow import OUTPUTS, Solve, list_column  # noqa: E402
+from kornia_pnpnet.arrow import OUTPUTS, Solve  # noqa: E402
 
 NAMES = ("world_points", "img_points", "intrinsics")
 
@@ -21,8 +22,7 @@ def draw(make_problems):
 
     def make(n=9, batch=7, seed=0, **more):
         problems = make_problems(n=n, batch=batch, seed=seed, dtype=torch.float32)
-        columns = {name: list_column(getattr(problems, name).numpy()) for name in NAMES}
-        return problems, pa.table(columns | {name: list_column(np.asarray(x)) for name, x in more.items()})
+        return problems, table_of(problems, **more)
 
     return make
 

@@ -1,7 +1,5 @@
 """The benchmarks measure what they say and compute their verdicts; nothing here depends on how fast a machine is."""
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import json
@@ -21,7 +19,6 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
-sys.path.insert(0, str(FOLDER))  # the benchmarks are scripts and import each other
 NAMES = ("contenders", "gpu", "harness", "page", "performance", "process", "solvers")
 contenders, gpu, harness, page, performance, process, benchmark = (importlib.import_module(name) for name in NAMES)
 
@@ -269,7 +266,7 @@ def write_matches(path, seed):
     p = map_tensors(lambda *x: torch.cat(x), *parts)
     arrays = {"world": p.world_points, "pixels": p.img_points, "mask": p.inliers | True, "K": p.intrinsics}
     arrays |= {"ratio": torch.where(p.inliers, 0.5, 0.9), "R": p.pose.rotation, "t": p.pose.translation}
-    arrays["error_px"] = reprojection_errors(p, p.pose).norm(dim=-1)
+    arrays["error_px"] = reprojection_errors(p).norm(dim=-1)
     arrays["kind"] = torch.arange(len(counts)).repeat_interleave(each)
     np.savez_compressed(path, **{name: value.numpy() for name, value in arrays.items()})
 

@@ -107,25 +107,6 @@ def test_where_there_is_no_pixel(uniform):
     assert (result.weights[:, 0] == 0).all()
 
 
-@pytest.mark.parametrize("lens", ["dist", "fisheye"])
-@pytest.mark.parametrize("bad", ["pixel", "camera", "coefficients"])
-def test_a_bad_lens_fails_alone_and_has_no_gradient(bad, lens, uniform):
-    points, pixels, _ = seen(uniform, 3, 12)
-    distorted, given = distort(pixels, lens)
-    camera, given = CAMERA.repeat(3, 1, 1), given[lens].repeat(3, 1)
-    leaves = points, distorted, camera, given, torch.ones(3, 12, dtype=torch.float64)
-    {"pixel": distorted, "camera": camera, "coefficients": given}[bad][1, 0] = math.nan
-    for x in leaves:
-        x.requires_grad_()
-    points, distorted, camera, given, sigma = leaves
-    result = create_solver("epnp-lm")(points, distorted, camera, img_sigma=sigma, **{lens: given})
-    assert result.ok.tolist() == [True, False, True]
-    for gradient in torch.autograd.grad(result.matrix.sum() + result.cost.sum(), leaves):
-        assert gradient.isfinite().all()
-        assert not gradient[1].any()
-        assert gradient[0].any()
-
-
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm"])
 @pytest.mark.parametrize("lens", ["dist", "fisheye"])
 def test_distorted_pixels_are_solved(name, lens, uniform):
@@ -160,15 +141,11 @@ def test_the_noise_goes_through_the_lens(signs, uniform):
 
 
 @pytest.mark.parametrize("signs", SIGNS)
-@pytest.mark.parametrize("lens", ["dist", "fisheye"])
-def test_lenses_of_negative_focal_lengths(lens, signs, uniform):
-    """Bearings and poses are the same."""
-    points, pixels, pose = seen(uniform, 2, 9)
-    distorted, given = distort(pixels, lens)
-    flip = torch.tensor([*signs, 1.0], dtype=torch.float64)
-    reflected, camera = flip[:2] * distorted, flip[:, None] * CAMERA
-    assert torch.equal(bearings(reflected, camera, **given), bearings(distorted, CAMERA, **given))
-    assert right(create_solver("pnpnet-set")(points, reflected, camera, **given), pose, 0.1, 0.01).all()
+@pytest.mark.parametrize("given", [{}, {"dist": DIST[:5]}, {"fisheye": FISHEYE}])
+def test_bearings_of_negative_focal_lengths(given, signs, uniform):
+    pixels, flip = 300.0 * uniform(2, 9, 2), torch.tensor([*signs, 1.0], dtype=torch.float64)
+    reflected = bearings(flip[:2] * pixels, flip[:, None] * CAMERA, **given)
+    assert torch.equal(reflected, bearings(pixels, CAMERA, **given))
 
 
 @pytest.mark.parametrize("signs", SIGNS)

@@ -1,7 +1,5 @@
 """The command line says what the library says, and bad input is one line and the exit code 2."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from data_helpers import arrays, table
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import WORDS, damage, many, places_in, run_main, spoiled
@@ -17,20 +18,17 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 def problem_file(kind):
     """The bytes of a sound file, and how its name ends."""
     problems = SyntheticProblems(n=9, batch_size=3, seed=0, outliers=OutlierMix(count=0)).batch(0)
-    arrays = dict(zip(("world_points", "img_points", "intrinsics"), (x.numpy() for x in problems[:3]), strict=True))
-    file = io.BytesIO()
+    single, file = arrays(problems.map(lambda x: x[0])), io.BytesIO()
     match kind:
         case "csv":
-            rows = np.concatenate((arrays["world_points"][0], arrays["img_points"][0]), 1)
+            rows = np.concatenate((single["world_points"], single["img_points"]), 1)
             file.write("\n".join(["X,Y,Z,u,v", *(",".join(map(str, row)) for row in rows)]).encode())
         case "npz":
-            np.savez(file, **{name: array[0] for name, array in arrays.items()})
+            np.savez(file, **single)
         case "shard npz":
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **arrays(problems))
         case "shard parquet":
-            from pyarrow import parquet, table
-
-            parquet.write_table(table({name: [*array.reshape(3, -1)] for name, array in arrays.items()}), file)
+            pytest.importorskip("pyarrow.parquet").write_table(table(problems), file)
     return file.getvalue(), kind.split()[-1]
 
 

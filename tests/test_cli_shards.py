@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from data_helpers import arrays, table
 
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.cli import main
@@ -14,10 +15,8 @@ from kornia_pnpnet.cli.correspondence_files import InputError
 
 pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
-from kornia_pnpnet.arrow import OUTPUTS, Solve, list_column  # noqa: E402
+from kornia_pnpnet.arrow import OUTPUTS, Solve  # noqa: E402
 from kornia_pnpnet.cli.shards import solve_shards  # noqa: E402
-
-NAMES = ("world_points", "img_points", "intrinsics")
 
 
 class Watched(Solve):
@@ -37,14 +36,6 @@ class Watched(Solve):
 @pytest.fixture
 def solve():
     return Solve("reppnp")
-
-
-def arrays(problems):
-    return {name: getattr(problems, name).numpy() for name in NAMES}
-
-
-def table(problems):
-    return pa.table({name: list_column(array) for name, array in arrays(problems).items()})
 
 
 @pytest.fixture

@@ -1,12 +1,11 @@
 """Linear algebra of small matrices, beside LAPACK's."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from kornia_pnpnet.core import linalg
-from kornia_pnpnet.core.linalg import align, eigenvectors, nearest_rotation, solve_leading, solve_positive
+from kornia_pnpnet.core.linalg import align, nearest_rotation, solve_leading, solve_positive
+from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, are_semi_definite, equivalent_sigma
 from kornia_pnpnet.refine.residual import rotation_angle
 
 
@@ -86,29 +85,14 @@ def test_align_finds_a_similarity(random_rotations, generator):
     torch.testing.assert_close(translation, means[1] - (rotation @ means[0][..., None])[..., 0])
 
 
-# --- systems and eigenvectors ---------------------------------------------------------------------------------------
+# --- systems ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def systems(generator):
-    """Positive definite matrices (20, 6, 6), right sides (20, 6), and the rows of the lower triangles."""
+    """Positive definite matrices (20, 6, 6) and right sides (20, 6)."""
     root = torch.randn(20, 6, 8, generator=generator, dtype=torch.float64)
-    matrix, rhs = root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
-    rows = [list(row[: i + 1].unbind(0)) for i, row in enumerate(matrix.permute(1, 2, 0).unbind(0))]
-    return matrix, rhs, rows
-
-
-def test_leading_blocks_are_solved(systems):
-    matrix, rhs, rows = systems
-    sizes = (1, 3, 6)
-    for size, solution in zip(sizes, solve_leading(rows, rhs.mT, sizes), strict=True):
-        expected = torch.linalg.solve(matrix[:, :size, :size], rhs[:, :size])
-        # The ridge is 16 roundings of the diagonal.
-        torch.testing.assert_close(torch.stack(solution, -1), expected, rtol=1e-10, atol=1e-10)
-    nan = torch.full_like(rhs[:, 0], torch.nan)
-    padded = [[*row, *[nan] * (5 - i)] for i, row in enumerate(rows)]  # above the diagonal nothing is read
-    again = solve_leading(padded, rhs.mT, (6,))[0]
-    assert torch.equal(torch.stack(again), torch.stack(solution))
+    return root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
 
 
 def test_a_singular_system_in_its_range_has_a_finite_solution():
@@ -124,7 +108,7 @@ def test_a_singular_system_in_its_range_has_a_finite_solution():
 @pytest.mark.usefixtures("few")
 def test_damped_systems_are_solved(systems):
     """One that is singular and one that is no number have the solution 0, with finite gradients, and harm no other."""
-    matrix, rhs, _ = systems
+    matrix, rhs = systems
     matrix = matrix.clone()
     matrix[3], matrix[4], matrix[5, 2, 2] = torch.nan, torch.ones(6, 6), -1.0
     damping = torch.linspace(0.0, 2.0, 20, dtype=torch.float64)
@@ -141,22 +125,6 @@ def test_damped_systems_are_solved(systems):
     assert all(x[..., matrix.isfinite().all((1, 2))].isfinite().all() for x in (*gradients, alone))
 
 
-def test_eigenvectors_are_orthonormal_and_nearly_diagonalise(generator):
-    matrix = torch.randn(500, 3, 3, generator=generator, dtype=torch.float64)
-    matrix = matrix @ matrix.mT
-    matrix[0], matrix[1] = torch.eye(3), torch.zeros(3, 3)  # equal eigenvalues
-    pairs = eigenvectors(matrix.permute(1, 2, 0))
-    values = torch.stack([value for value, _ in pairs], -1)
-    vectors = torch.stack([vector.mT for _, vector in pairs], -1)  # (B, 3, 3)
-    eye = torch.eye(3, dtype=torch.float64).expand(500, 3, 3)
-    torch.testing.assert_close(vectors @ vectors.mT, eye, rtol=0, atol=1e-12)
-    scale = torch.linalg.matrix_norm(matrix)[:, None]
-    error = (values - torch.linalg.eigvalsh(matrix)).abs() / scale.clamp(min=1e-300)
-    assert (error < 1e-2).all()
-    assert error.median() < 1e-9
-    torch.testing.assert_close(values, values.sort(-1).values)
-
-
 @pytest.mark.parametrize("count", [1, 2000])
 def test_gradients_are_finite_for_any_size_of_the_matrix(count):
     for size in (1e-38, 1e-30, 1e-20, 1e-15, 1.0, 1e15):
@@ -164,3 +132,37 @@ def test_gradients_are_finite_for_any_size_of_the_matrix(count):
         solution, _ = solve_positive(matrix, torch.full((6, count), size), torch.tensor(0.0))
         (0.0 * solution).sum().backward()
         assert matrix.grad.isfinite().all()
+
+
+# --- symmetric matrices by their entries ------------------------------------------------------------------------------
+
+KINDS = {2: Symmetric2, 3: Symmetric3}
+
+
+def matrices(size, count=200, eigenvalues=None):
+    generator = torch.Generator().manual_seed(size)
+    turn = torch.linalg.qr(torch.randn(count, size, size, generator=generator, dtype=torch.float64)).Q
+    values = 10.0 ** (4.0 * torch.rand(count, size, generator=generator, dtype=torch.float64) - 2.0)
+    values = values if eigenvalues is None else torch.tensor(eigenvalues, dtype=torch.float64).expand(count, size)
+    return (turn * values[:, None]) @ turn.mT
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [2, 3])
+def test_semi_definite_is_told_up_to_rounding(size, dtype):
+    for smallest, expected in ((0.0, True), (1e-3, True), (-1e-3, False), (torch.nan, False), (torch.inf, False)):
+        matrix = matrices(size, eigenvalues=[1.0, 1.0, smallest][-size:]).to(dtype)
+        assert (are_semi_definite(KINDS[size].of(matrix)) == expected).all(), smallest
+        assert not are_semi_definite(KINDS[size].of(-matrix)).any()
+    assert are_semi_definite(KINDS[size].of(torch.zeros(1, size, size, dtype=dtype))).all()
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_the_equivalent_sigma_has_the_same_trace(size):
+    matrix = matrices(size)
+    sigma = equivalent_sigma(KINDS[size].of(matrix))
+    torch.testing.assert_close(size * sigma.square(), matrix.diagonal(dim1=1, dim2=2).sum(-1))
+    zero = torch.zeros(1, size, size, requires_grad=True)
+    equivalent_sigma(KINDS[size].of(zero)).sum().backward()
+    assert (zero.grad == 0).all()
+    assert equivalent_sigma(KINDS[size].of(torch.full((1, size, size), torch.nan))).isnan().all()

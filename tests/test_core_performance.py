@@ -1,7 +1,5 @@
 """A compiled solver is the same solver; where it cannot be compiled it runs as it is, and says so once."""
 
-from __future__ import annotations
-
 import copy
 import multiprocessing
 import os

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from kornia_pnpnet import PnPResult, Pose, PosePrior, create_solver, pose_covariance
@@ -15,14 +14,12 @@ def tangent(estimate, truth):
     return torch.cat((turn, estimate.translation - truth.translation), -1)
 
 
-def test_zero_weight_equals_removing_and_a_single_problem_its_batch(make_problems):
+def test_zero_weight_equals_removing(make_problems):
     p = make_problems(n=12, batch=5)
     weights = (torch.arange(12) < 8).double().expand(5, 12)
     half = pose_covariance(p.pose, *p[:3], img_sigma=2.0, weights=weights)
     part = pose_covariance(p.pose, p.world_points[:, :8], p.img_points[:, :8], p.intrinsics, img_sigma=2.0)
     torch.testing.assert_close(half, part)
-    alone = p.map(lambda x: x[1])
-    torch.testing.assert_close(pose_covariance(alone.pose, *alone[:3], img_sigma=2.0, weights=weights[1]), half[1])
 
 
 def test_units_of_the_noise(make_problems):
@@ -139,18 +136,3 @@ def test_a_prior_adds_its_information(make_problems):
     alone = pose_covariance(*given, img_sigma=1.0)
     found = pose_covariance(*given, img_sigma=1.0, prior=PosePrior(pose, information))
     torch.testing.assert_close(torch.linalg.inv(found), torch.linalg.inv(alone) + information, rtol=1e-6, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["pose", "world_points", "img_points", "intrinsics", "img_sigma", "weights"])
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e200])
-def test_numbers_of_any_size_give_no_nan_and_other_shapes_an_error(name, value, make_problems):
-    p = make_problems(n=6, batch=2)
-    one = torch.ones(2, 6, dtype=torch.float64)
-    given = {"pose": p.pose, "world_points": p.world_points, "img_points": p.img_points, "intrinsics": p.intrinsics}
-    given |= {"img_sigma": one, "weights": one.clone()}
-    spoil = given[name].translation if name == "pose" else given[name]
-    spoil[0, 0] = value
-    assert not pose_covariance(**given).isnan().any()
-    changed = Pose(p.pose.rotation, p.pose.translation[:1]) if name == "pose" else given[name][:, :1]
-    with pytest.raises(BaseError):
-        pose_covariance(**given | {name: changed})

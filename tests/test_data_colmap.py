@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_helpers import CENTRE, FOCAL, HEIGHT, WIDTH, make_view, pose_of, reprojection
+from data_helpers import CENTRE, FOCAL, HEIGHT, WIDTH, make_view, pose_of
+from helpers import reprojection_errors
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import damage, finite, many, names_the_file
@@ -259,7 +260,7 @@ def test_real_models_reproject(pycolmap, folder, views, observations):
     assert torch.cat(errors).median() < 1
     assert max(error.median() for error in errors) < 2
     problems = SceneProblems(scene, batch_size=1000, outliers=OutlierMix(count=2)).batch(0)
-    error = reprojection(problems).norm(dim=-1)
+    error = reprojection_errors(problems).norm(dim=-1)
     assert error[problems.inliers].median() < 1
     assert error[problems.inliers].max() < 12
     assert error[~problems.inliers].median() > 200

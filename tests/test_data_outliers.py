@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_counts, assert_normal, assert_uniform, draw, reprojection
+from data_helpers import COUNT, assert_counts, assert_normal, assert_uniform, draw
+from helpers import reprojection_errors
 from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import create_solver
@@ -60,8 +61,8 @@ def test_sensing_pixels_are_anywhere_in_the_image():
 def test_mismatched_pixels_belong_to_another_point_of_the_box():
     p = draw(9, 5000, outliers=OutlierMix(count=3, mismatch_share=1.0), world_sigma=0.0, img_sigma=0.0)
     plain = draw(9, 5000, world_sigma=0.0, img_sigma=0.0)
-    assert reprojection(p)[p.inliers].abs().max() < 1e-8
-    assert (reprojection(p)[~p.inliers].norm(dim=-1) > 1.0).double().mean() > 0.999
+    assert reprojection_errors(p)[p.inliers].abs().max() < 1e-8
+    assert (reprojection_errors(p)[~p.inliers].norm(dim=-1) > 1.0).double().mean() > 0.999
     # Distributed like the pixels of inliers: the deciles hold a tenth each.
     other = p.img_points[~p.inliers]
     deciles = plain.img_points[..., 0].flatten().quantile(torch.linspace(0.1, 0.9, 9, dtype=torch.float64))
@@ -78,13 +79,13 @@ def test_pixels_of_outliers_have_noise(mismatch_share):
 
 def test_near_outliers_have_distances_in_pixels_beyond_the_noise():
     p = draw(9, 2000, outliers=OutlierMix(count=3, near_share=1.0), world_sigma=0.0)
-    off = reprojection(p).norm(dim=-1)
+    off = reprojection_errors(p).norm(dim=-1)
     assert off[p.inliers].max() < 5.5
     assert 1.0 < off[~p.inliers].min() < off[~p.inliers].max() < 55.0
     mix = OutlierMix(count=3, near_share=1.0, near_pixels=(3.0, 30.0))
-    off = reprojection(p := draw(9, outliers=mix, world_sigma=0.0, img_sigma=1e-6)).norm(dim=-1)[~p.inliers]
+    off = reprojection_errors(p := draw(9, outliers=mix, world_sigma=0.0, img_sigma=1e-6)).norm(dim=-1)[~p.inliers]
     assert_uniform(off.log(), math.log(3.0) - 1e-5, math.log(30.0) + 1e-5)
-    off = reprojection(p := draw(9, 2000, outliers=mix, world_sigma=0.0, img_sigma=5.0)).norm(dim=-1)[~p.inliers]
+    off = reprojection_errors(p := draw(9, 2000, outliers=mix, world_sigma=0.0, img_sigma=5.0)).norm(dim=-1)[~p.inliers]
     assert off.min() > 25 - 4 * 5  # 5 and 10 standard deviations, with noise
     assert off.max() < 50 + 5 * 5
 
@@ -107,7 +108,7 @@ def test_crowds_share_few_pixels():
     assert pixels.max() == 3
     assert (pixels.bincount()[1:] > 400).all()
     assert 0.01 < (members[p.inliers] > 1).double().mean() < 0.1, "some crowds gather on the pixel of an inlier"
-    assert reprojection(p)[p.inliers].norm(dim=-1).max() < 6
+    assert reprojection_errors(p)[p.inliers].norm(dim=-1).max() < 6
 
 
 def test_crowds_of_a_point_have_many_pixels():
@@ -118,7 +119,7 @@ def test_crowds_of_a_point_have_many_pixels():
     )
     assert not (points & pixels).any()
     assert_counts(torch.stack((points.sum(), pixels.sum())), (0.5 * 30 / 31, 0.5 * 30 / 31))
-    assert reprojection(p)[p.inliers].norm(dim=-1).max() < 6
+    assert reprojection_errors(p)[p.inliers].norm(dim=-1).max() < 6
 
 
 @pytest.mark.parametrize(("mirrored", "angle"), [(0.0, 0.0), (1.0, 0.0), (0.0, math.pi)])

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from data_helpers import HEIGHT, WIDTH, assert_counts, assert_uniform, make_scene, make_view, reprojection
+from data_helpers import HEIGHT, WIDTH, assert_counts, assert_uniform, make_scene, make_view
+from helpers import reprojection_errors
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch.testing import assert_close
@@ -30,7 +31,7 @@ def test_view_checks_itself(field, value, message):
 @pytest.mark.parametrize("outliers", [None, OutlierMix()])
 def test_inliers_reproject_exactly_and_outliers_do_not(outliers):
     problems = SceneProblems(make_scene(40, 30), batch_size=500, outliers=outliers).batch(3)
-    error = reprojection(problems).norm(dim=-1)
+    error = reprojection_errors(problems).norm(dim=-1)
     assert error[problems.inliers].max() < 1e-9
     wrong = error[~problems.inliers]
     assert outliers is None or wrong.median() > 50
@@ -96,7 +97,7 @@ def test_mismatches_of_the_scene_are_marked():
     view = make_view(count=40, inliers=inliers)
     view = replace(view, img_points=view.img_points + 100.0 * ~inliers[:, None])
     problems = SceneProblems(Scene("toy", (view,)), batch_size=500).batch(0)
-    assert torch.equal(reprojection(problems).norm(dim=-1) < 1, problems.inliers)
+    assert torch.equal(reprojection_errors(problems).norm(dim=-1) < 1, problems.inliers)
     assert_close(problems.inliers.double().mean().item(), 0.75, rtol=0, atol=0.03)
 
 

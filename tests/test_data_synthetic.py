@@ -1,4 +1,4 @@
-"""Synthetic problems against the protocol, by the distributions of their poses, points and noise."""
+"""Synthetic problems, of one camera against the protocol and of many cameras by their own geometry."""
 
 import itertools
 import math
@@ -6,7 +6,8 @@ from functools import partial
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_normal, assert_uniform, draw, make_scene, reprojection, same
+from data_helpers import COUNT, assert_normal, assert_uniform, draw, make_scene, same
+from helpers import reprojection_errors
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
 from kornia_pnpnet.core.trees import iter_tensors
@@ -41,7 +42,7 @@ def test_points_are_uniform_in_the_box_in_front_of_the_camera():
     cam = p.true_cam_points
     for axis, (low, high) in enumerate(((-10, 10), (-10, 10), (10, 90))):
         assert_uniform(cam[..., axis], low - 1e-9, high + 1e-9)
-    assert reprojection(p).abs().max() < 1e-8
+    assert reprojection_errors(p).abs().max() < 1e-8
     assert p.inliers.all()
     # The image is exactly the near face of the box.
     assert p.img_points.abs().max() <= 3400 + 1e-6
@@ -54,14 +55,14 @@ def test_noise_is_normal_with_its_standard_deviation():
     clean, noisy = (draw(9, img_sigma=0.0, world_sigma=sigma) for sigma in (0.0, 0.05))
     assert torch.equal(noisy.img_points, clean.img_points)
     assert_normal(noisy.world_points - clean.world_points, 0.05)
-    assert_normal(reprojection(draw(9, world_sigma=0.0, img_sigma=3.0)), 3.0)
+    assert_normal(reprojection_errors(draw(9, world_sigma=0.0, img_sigma=3.0)), 3.0)
 
 
 @pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])
 def test_noise_from_a_range_is_log_uniform_over_the_problems(name):
     clean = {"img_sigma": 0.0, "world_sigma": 0.0}
     p = draw(4, known_noise=1.0, **{**clean, name: (0.01, 1.0)})
-    noise = reprojection(p) if name == "img_sigma" else p.world_points - draw(4, **clean).world_points
+    noise = reprojection_errors(p) if name == "img_sigma" else p.world_points - draw(4, **clean).world_points
     sigma = getattr(p, name)
     assert_normal(noise / sigma[:, None, None], 1.0)
     assert_uniform(sigma.log10(), -2.0 - 1e-9, 1e-9)
@@ -81,7 +82,7 @@ def test_a_share_of_problems_comes_with_sigmas():
 def test_heavy_tails_keep_the_sigma_of_the_bulk():
     def lengths(degrees):
         p = draw(20, 4000, img_sigma=2.0, world_sigma=0.0, degrees=degrees)
-        return reprojection(p).norm(dim=-1) / 2.0, p.inliers
+        return reprojection_errors(p).norm(dim=-1) / 2.0, p.inliers
 
     for degrees in (2.0, 5.0):
         length, inliers = lengths(degrees)
@@ -102,7 +103,7 @@ def test_sigmas_of_pairs_are_log_normal_about_that_of_the_problem():
         assert torch.equal(known.all(1), known.any(1))
         assert_normal((sigma[known] / middle).log(), 0.5)
     p = draw(200, 500, sigma_spread=(0.1, 1.0), known_noise=1.0, world_sigma=0.0)
-    assert_normal(reprojection(p) / p.img_sigma[..., None], 1.0)
+    assert_normal(reprojection_errors(p) / p.img_sigma[..., None], 1.0)
     spread = p.img_sigma.log().std(1).log10()
     torch.testing.assert_close(spread.quantile(0.5).item(), -0.5, rtol=0, atol=0.06)
 
@@ -112,7 +113,7 @@ def test_bunched_inliers_lie_together_and_outliers_anywhere():
     area = {}
     for share in (0.0, 0.5, 1.0):
         p = draw(80, 1000, bunched_share=share, outliers=mix, img_sigma=0.0, world_sigma=0.0)
-        assert reprojection(p)[p.inliers].abs().max() < 1e-8
+        assert reprojection_errors(p)[p.inliers].abs().max() < 1e-8
         assert (p.inliers.sum(-1) == 20).all()
         pixels = p.img_points[p.inliers].unflatten(0, (-1, 20))
         wrong = p.img_points[~p.inliers].unflatten(0, (-1, 60))
@@ -219,3 +220,39 @@ def test_copies_are_whole_pairs_and_leave_eight_originals():
     for x in (problems.img_points, problems.img_sigma[..., None], problems.confidence[..., None]):
         assert (distances(x, x)[same_point] == 0).all()
     assert (same_point[:, :8, :8].sum(-1) == 1).all()
+
+
+# --- many cameras -----------------------------------------------------------------------------------------------------
+
+
+def draw_cameras(**options):
+    return CameraProblems(**{"n": 8, "batch_size": 4000, "seed": 3, "dtype": torch.float64, **options}).batch(0)
+
+
+def test_pixels_show_their_points_and_fields_of_view_are_uniform():
+    problems = draw_cameras(img_sigma=0.0, field_of_view=(30.0, 90.0))
+    assert reprojection_errors(problems).abs().max() < 1e-6
+    assert (problems.true_cam_points[..., 2] > 0).all()
+    angle = 2.0 * torch.atan(1000.0 / problems.intrinsics[:, 0, 0])
+    assert_uniform(angle.rad2deg(), 30.0, 90.0)
+
+
+def test_outliers_are_as_many_as_asked_for():
+    problems = draw_cameras(n=10, outlier_share=0.3, img_sigma=0.0)
+    assert (problems.inliers.sum(1) == 7).all()
+    error = reprojection_errors(problems).norm(dim=-1)
+    assert error[problems.inliers].max() < 1e-6
+    assert (error[~problems.inliers] > 1.0).double().mean() > 0.99
+    assert problems.inliers.double().mean(0).std() < 0.03  # any place
+
+
+def test_rigs():
+    problems = draw_cameras(cameras=3, baseline=0.2, img_sigma=0.0, batch_size=50)
+    rotation, translation = problems.cam_from_rig
+    seen = (problems.intrinsics @ problems.true_cam_points[..., None])[..., 0]
+    torch.testing.assert_close(seen[..., :2] / seen[..., 2:], problems.img_points)
+    assert torch.equal(rotation[:, 0], rotation[:, 3])
+    assert not torch.equal(rotation[:, 0], rotation[:, 1])
+    centres = -(rotation.mT @ translation[..., None])[..., 0].norm(dim=-1)
+    assert (centres.amax(1) / centres.amin(1) - 1).abs().max() < 1e-9
+    assert "cam_from_rig" in problems.known

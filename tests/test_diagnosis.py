@@ -1,7 +1,5 @@
 """Each usual mistake is named, and right input is left alone."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError

@@ -210,13 +210,3 @@ def test_pytorch3ds_solution_has_the_axes_of_the_page():
     theirs, ours = (pose_errors(x, page["problems"].pose).rotation_error_deg.median() for x in found)
     assert theirs > 5.0
     assert ours < 1.0
-
-
-def test_matches_of_kornias_matcher_make_one_batch():
-    page = snippet("howto/kornia.md")
-    moved = torch.tensor([-0.2, 0.0, 0.0]).expand(2, 3)
-    points, pixels, camera = (page[name] for name in ("points", "pixels1", "camera"))
-    with torch.no_grad():
-        result = page["solver"](points, pixels, camera, **page["known"])
-    assert result.ok.all()
-    assert torch.allclose(result.translation, moved, atol=0.005)

@@ -1,20 +1,15 @@
 """Bounds: least squares of the true inliers, their weights, and the success that the protocol measured."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-from helpers import rate
-from hypothesis import given
-from hypothesis import strategies as st
-from kornia.core.exceptions import BaseError
+from helpers import assert_same, rate
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from strategies import SOLVERS, batches, check, many, poses
+from laws import BAD, Case, make_bad, take
+from strategies import finite
 from torch.func import jacrev, vmap
 
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
-from kornia_pnpnet.evaluation.comparison import SeesTruth
 from kornia_pnpnet.result import Problems
 
 BOUNDS = (KnownInliers, KnownInliersAndNoise)
@@ -77,24 +72,16 @@ def test_success_is_what_the_protocol_measured(mix, inliers, inliers_and_noise, 
         assert rate(bound.solve_with_truth(problems), problems) == pytest.approx(expected, abs=0.022)
 
 
-@pytest.mark.parametrize("sigmas", [{"img_sigma": -1.0}, {"img_sigma": 0.0, "world_sigma": 0.0}])
-def test_sigmas_are_checked(sigmas):
-    with pytest.raises(BaseError, match="img_sigma"):
-        KnownInliersAndNoise(**sigmas)
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_bad_problems_fail_alone(bound):
+    kinds, sound, spoiled = make_bad(Case("identity-lm"))
+    arguments = "world_points", "img_points", "intrinsics"
 
+    def solved(call):
+        inliers = torch.ones_like(sound["weights"], dtype=torch.bool)
+        return bound().solve_with_truth(Problems(*(call[x] for x in arguments), sound["init"], inliers))
 
-@many(60)
-@given(
-    batches(), st.data(), st.sampled_from([KnownInliers(), KnownInliersAndNoise(), KnownInliersAndNoise(img_sigma=0)])
-)
-def test_bounds_take_anything(case, data, bound):
-    inputs, _, _, kinds = case
-    assert isinstance(bound, SeesTruth)
-    assert not isinstance(SOLVERS["epnp"], SeesTruth)
-    batch, count = inputs[0].shape[:2]
-    inliers = torch.rand(batch, count, generator=torch.Generator().manual_seed(batch)) > 0.3
-    problems = Problems(*inputs, data.draw(poses(batch, inputs[0].dtype)), inliers)
-    inliers[:, 0] = True  # the pair that `batches` spoils
-    if isinstance(bound, KnownInliersAndNoise):  # an infinite point has infinite noise, and so the weight 0
-        kinds = ["nothing" if kind == "infinite point" else kind for kind in kinds]
-    check(bound.solve_with_truth(problems), inputs, kinds)
+    found = solved(spoiled)
+    assert_same(take(slice(0, None, 2), found), take(slice(0, None, 2), solved(sound)))
+    assert not any(ok and BAD[kind][0] in arguments for kind, ok in zip(kinds, found.ok[1::2], strict=True))
+    finite(*found[:4], found.init)

@@ -1,7 +1,6 @@
 """Comparing solvers: rows and their summaries, results files, continuing an evaluation, inputs of solvers."""
 
-from __future__ import annotations
-
+import json
 import math
 import re
 from functools import reduce
@@ -154,14 +153,7 @@ def path(tmp_path):
     return tmp_path / "new" / "results.json"
 
 
-def test_a_results_file_round_trips(evaluated, path):
-    save_results(evaluated, path)
-    assert load_results(path) == evaluated
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        save_results({**evaluated, "rows": [math.nan]}, path)
-
-
-@pytest.mark.parametrize("content", ["", "[]", '{"format": 99}', '{"format": 1, "rows": []}', "\x00"])
+@pytest.mark.parametrize("content", ["", "{", "[" * 9999, "[]", '{"format": 99}', '{"format": 1, "rows": []}', "\x00"])
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "other.json"
     path.write_text(content)
@@ -173,6 +165,11 @@ def test_other_files_are_refused(tmp_path, content):
     ("place", "value"),
     [
         ("rows.0.success.rate", 1.5),
+        ("rows.0.success.rate", math.nan),
+        ("rows.0.success.total", 0.5),
+        ("rows.0.success.total", 2**63),
+        ("rows.0.us_per_problem", "1"),
+        ("rows.0.us_per_problem", 10**400),
         ("rows.0.solver", "t"),
         ("rows.0.per_problem.ok", 1),
         ("rows.0.per_problem", {"rotation_error_deg": [], "translation_error": [0.0], "ok": [1]}),
@@ -185,7 +182,7 @@ def test_the_wrong_entry_of_a_file_is_named(evaluated, place, value, path):
     results = load_results(path)
     *inner, last = (int(x) if x.isdecimal() else x for x in place.split("."))
     reduce(getitem, inner, results)[last] = value
-    save_results(results, path)
+    path.write_text(json.dumps(results))
     with pytest.raises(ValueError, match=r"results\.json.*: " + re.escape(place.replace(".0", "[0]"))):
         load_results(path)
 

@@ -1,7 +1,5 @@
 """Solvers, bounds and sets of problems by the names that a user types."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -25,11 +25,6 @@ def run(tmp_path, name, *arguments, results=None):
     return json.loads((tmp_path / f"{results or name}.json").read_text())
 
 
-@pytest.fixture(autouse=True)
-def _examples(monkeypatch):
-    monkeypatch.syspath_prepend(EXAMPLES)
-
-
 @pytest.fixture
 def hall():
     return pytest.importorskip("rendered_hall")

@@ -1,11 +1,6 @@
 """Pictures show the data of their arguments, can be read, and leave matplotlib's global state alone."""
 
-from __future__ import annotations
-
-import importlib
 import itertools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +9,7 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("pandas")
 
+import figures
 import matplotlib as mpl
 import pandas as pd
 from matplotlib import pyplot
@@ -22,9 +18,6 @@ from kornia_pnpnet import create_solver
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.evaluation import EvaluationData, evaluate, plots
 from kornia_pnpnet.metrics import success_rate
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "docs" / "results"))
-import figures
 
 # -- the pictures of the package ---------------------------------------------------------------------------------------
 
@@ -90,13 +83,6 @@ def test_training_picture_reads_the_history(tmp_path, drawn):
         history.write_text(text)
         with pytest.raises(ValueError, match=message):
             plots.plot_training(tmp_path / "a.png", history)
-
-
-def test_a_missing_package_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.delitem(sys.modules, "kornia_pnpnet.evaluation.plots")
-    with pytest.raises(ImportError, match=r"\.\[eval\]"):
-        importlib.import_module("kornia_pnpnet.evaluation.plots")
 
 
 # -- the figures of the paper's protocol -------------------------------------------------------------------------------

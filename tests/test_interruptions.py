@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from data_helpers import arrays, table
 from helpers import assert_same
 from hypothesis import given
 from hypothesis import strategies as st
@@ -108,12 +109,6 @@ def test_a_full_disk_loses_nothing(tmp_path):
     assert_same_runs(tmp_path / "run", tmp_path / "whole")
 
 
-def arrays_of(source):
-    """The arrays of a shard."""
-    inputs = (x.numpy() for x in source.batch(0)[:3])
-    return dict(zip(("world_points", "img_points", "intrinsics"), inputs, strict=True))
-
-
 def solve(source, out, *options):
     return main(["solve", "--batch", "--solver", "epnp", *options, "--out", str(out), str(source)])
 
@@ -128,7 +123,7 @@ def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, capsys):
     source, out = tmp_path / "in", tmp_path / "out"
     source.mkdir()
     for name, count in (("a", 10), ("b", 1000), ("c", 10)):
-        np.savez(source / f"{name}.npz", **arrays_of(SyntheticProblems(n=6, batch_size=count, seed=0)))
+        np.savez(source / f"{name}.npz", **arrays(SyntheticProblems(n=6, batch_size=count, seed=0).batch(0)))
     process = in_a_process(_shards_on_a_full_disk, source, out)
     process.join()
     assert process.exitcode == 2
@@ -140,17 +135,15 @@ def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, capsys):
 @pytest.mark.slow
 def test_kill_9_at_any_moment_loses_no_results(tmp_path):
     """After any number of kills the results are those of a call without kills, and no result is made twice."""
-    pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
     source, whole = tmp_path / "in", tmp_path / "whole"
     source.mkdir()
     for i in range(20):
-        arrays = arrays_of(SyntheticProblems(n=6, batch_size=1000, seed=i))
+        problems = SyntheticProblems(n=6, batch_size=1000, seed=i).batch(0)
         if i % 4 == 0:
-            lists = {key: [*x.reshape(1000, -1)] for key, x in arrays.items()}
-            parquet.write_table(pyarrow.table(lists), source / f"{i:02}.parquet")
+            parquet.write_table(table(problems), source / f"{i:02}.parquet")
         else:
-            np.savez(source / f"{i:02}.npz", **arrays)
+            np.savez(source / f"{i:02}.npz", **arrays(problems))
     names = {f"{path.stem}.parquet" for path in source.iterdir()}
 
     def start(out):

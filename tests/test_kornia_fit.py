@@ -1,13 +1,19 @@
 """Cameras and groups of Kornia in and out, and the function that is called like its DLT."""
 
+import math
+
 import pytest
 import torch
 from kornia.core.exceptions import ShapeError, ValueCheckError
 from kornia.geometry import solve_pnp_dlt
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.camera.perspective import project_points
+from kornia.geometry.linalg import inverse_transformation, transform_points
 
-from kornia_pnpnet import PnPNet, create_solver, pose_covariance, solve_pnp
+from kornia_pnpnet import PnPNet, Pose, create_solver, pose_covariance, solve_pnp
 from kornia_pnpnet.cameras import bearings
+from kornia_pnpnet.problem import Problem, State
+from kornia_pnpnet.refine.residual import project
 
 
 def cameras(intrinsics):
@@ -107,3 +113,32 @@ def test_cameras_of_bearings_keep_the_leading_dimensions(make_problems):
     result = create_solver("epnp-lm")(world, rays, cameras(p.intrinsics))
     torch.testing.assert_close(result.intrinsics, matrices)
     assert result.matrix.equal(create_solver("epnp-lm")(world, rays, matrices).matrix)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 9.9e-4, 1.1e-3, 0.1, 1.0, 3.0, math.pi])
+def test_rotation_vectors_become_rotations_and_back_with_finite_gradients(angle, dtype, generator):
+    axis = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=-1)
+    vector = (angle * axis).to(dtype).requires_grad_()
+    rotation = Pose.from_rvec(vector, torch.zeros_like(vector)).rotation
+    back = Pose(rotation, torch.zeros_like(vector)).rvec
+    if angle < 3.1:  # at a half turn two vectors give one rotation
+        torch.testing.assert_close(back, vector, rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-3)
+    assert torch.autograd.grad(back.sum(), vector)[0].isfinite().all()
+
+
+@pytest.mark.parametrize("is_rig", [False, True])
+def test_our_projection_is_kornias(is_rig, random_rotations, generator):
+    """Cameras with zoom, and rigs, whose pairs have a pose of their own."""
+    points = 2.0 * torch.rand(7, 5, 3, generator=generator, dtype=torch.float64) + torch.tensor([-1.0, -1.0, 4.0])
+    pose = Pose(random_rotations(7), torch.randn(7, 3, generator=generator, dtype=torch.float64))
+    zoom = 0.2 * torch.randn(7, 1, generator=generator, dtype=torch.float64) * (not is_rig)
+    rig = Pose(random_rotations(35, seed=1), torch.randn(35, 3, generator=generator, dtype=torch.float64))
+    in_rig = transform_points(inverse_transformation(rig.matrix), points.view(35, 1, 3)).view(7, 5, 3)
+    world = transform_points(inverse_transformation(pose.matrix), in_rig if is_rig else points)
+    of_pairs = Pose(*(x.unflatten(0, (7, 5)) for x in rig)) if is_rig else None
+    problem = Problem.of(world, torch.zeros(7, 5, 2, dtype=torch.float64), 800.0, rig=of_pairs)
+    found = project(State(pose, zoom), problem).residual.permute(2, 1, 0)
+    intrinsics = torch.diag_embed(torch.cat((zoom, zoom, 0.0 * zoom), 1).exp() * torch.tensor([800.0, 800.0, 1.0]))
+    expected = project_points(points, intrinsics[:, None].expand(7, 5, 3, 3))
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)

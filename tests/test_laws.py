@@ -13,17 +13,9 @@ from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gra
 from strategies import many
 
 from kornia_pnpnet import (
-    PoseLoss,
-    SetLoss,
     create_solver,
-    depth_points,
     heatmap_keypoints,
-    monte_carlo_pose_loss,
-    pose_covariance,
-    pose_errors,
-    success,
 )
-from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import (
     BoxPoints,
@@ -47,6 +39,10 @@ QUICK = [
     Case("pnpnet-set", extra="prior"),
     Case("epnp-lm", "pixels", "covariance", extra="prior"),
     Case("p3p-ransac", extra="confidence"),
+    Case("pnpnet-set", extra="dist"),
+    Case("p3p-ransac", "pixels", "sigma", extra="fisheye"),
+    Case("epnp-lm", "pixels", "covariance", extra="dist"),
+    *(Case(name, dtype=torch.float32) for name in PEERS),
 ]
 FEW_GRADIENTS = [Case("identity-lm", *x) for x in ([], ["rig", "covariance"], ["pixels", "sigma", "unknown"])]
 GRADIENTS = [Case("identity-lm", *x) for x in product(CAMERAS, NOISES, FOCALS)]
@@ -114,33 +110,6 @@ def test_heat_maps_of_half_precision_are_those_of_float32(dtype, generator):
 EVERY_KIND = OutlierMix(
     max_ratio=0.5, mismatch_share=0.3, structured_share=0.5, near_share=0.2, crowd_share=0.3, point_crowd_share=0.5
 )
-
-
-def every_function(dtype):
-    """Results of the functions beside the solvers for the same problems."""
-    problems = SyntheticProblems(n=12, batch_size=3, seed=1, dtype=dtype).batch(0)
-    points, pixels, camera, pose = problems[:4]
-    noise = {"img_sigma": 1.0, "world_sigma": 0.05}
-    result, starts = build(Case("pnpnet-set", dtype=dtype)).with_starts(points, pixels, camera, **noise)
-    torch.manual_seed(0)
-    yield monte_carlo_pose_loss(pose, result.pose, points, pixels, camera, **noise)
-    yield PoseLoss()(result, problems), SetLoss()(result, problems, 1.0, starts)
-    yield success(pose_errors(result.pose, pose))
-    yield pose_covariance(pose, points, pixels, camera, **noise, focal="unknown", focal_sigma=0.1)
-    yield (
-        depth_points(pixels, points[..., 2].abs() + 1.0, camera, pose, depth_sigma=0.1),
-        heatmap_keypoints(points[None]),
-    )
-    yield [bearings(pixels, camera, **{name: camera.new_zeros(4)}) for name in ("dist", "fisheye")]
-    yield result.pose.rvec, result.pose.quaternion, result.pose.camera(camera).camera_matrix
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_functions_do_not_depend_on_defaults(dtype):
-    expected = [*every_function(dtype)]
-    with other_defaults(torch.float64 if dtype == torch.float32 else torch.float16):
-        found = [*every_function(dtype)]
-    assert_same(found, expected)
 
 
 @pytest.mark.parametrize(

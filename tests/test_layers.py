@@ -1,7 +1,5 @@
 """Arrows go one way: which module of the package may import which."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

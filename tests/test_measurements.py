@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from kornia.core.exceptions import BaseError, ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.conversions import convert_points_from_homogeneous, convert_points_to_homogeneous
 from kornia.geometry.linalg import transform_points
 from kornia.geometry.subpix import spatial_soft_argmax2d
@@ -62,20 +61,6 @@ def test_a_map_with_nan_spoils_its_own_problem_only(make_problems, generator):
     result.translation.sum().backward()
     assert heatmaps.grad[0].isfinite().all()
     assert heatmaps.grad[0].any()
-
-
-@pytest.mark.parametrize(
-    ("heatmaps", "options"),
-    [
-        (torch.zeros(4, 4), {}),
-        (torch.zeros(1, 1, 4, 4, dtype=torch.bool), {}),
-        (torch.zeros(1, 1, 4, 4), {"temperature": 0.0}),
-        (torch.zeros(1, 1, 4, 4), {"stride": 0}),
-    ],
-)
-def test_errors_of_heat_maps(heatmaps, options):
-    with pytest.raises(BaseError):
-        heatmap_keypoints(heatmaps, **options)
 
 
 @pytest.fixture
@@ -155,20 +140,6 @@ def test_missing_depth_is_nan_without_a_gradient_and_can_be_masked(seen):
     assert not depth.grad[~good].any()
     masked = solver(points, *other, mask=good, img_sigma=1.0, world_cov=covariance)
     assert masked.ok[1]
-
-
-def test_float32_and_errors_of_depth(seen):
-    points, pose, pixels, depth = seen
-    single = Pose(*(x.float() for x in pose))
-    found, covariance = depth_points(pixels.float(), depth.float(), CAMERA.float(), single, depth_sigma=0.1)
-    assert found.dtype == covariance.dtype == torch.float32
-    torch.testing.assert_close(found, points.float(), atol=1e-4, rtol=1e-4)
-    with pytest.raises(ShapeError, match="depth"):
-        depth_points(pixels, depth[:, :3], CAMERA, pose, depth_sigma=0.1)
-    with pytest.raises(ValueCheckError, match="not both"):
-        depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.1, img_sigma=1.0, img_cov=torch.zeros(2, 7, 2, 2))
-    with pytest.raises(TypeCheckError, match="depth must be a tensor"):
-        depth_points(pixels, 2.0, CAMERA, pose, depth_sigma=0.1)
 
 
 def test_a_matrix_that_is_no_rotation_is_replaced_by_the_nearest():

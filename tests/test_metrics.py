@@ -1,13 +1,10 @@
 """Errors, success and its interval against closed forms and published values."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
-from kornia.core.exceptions import BaseError
 from strategies import ERRORS
 
 from kornia_pnpnet import Pose, pose_errors, success, success_rate
@@ -15,16 +12,17 @@ from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.metrics import PoseErrors, reliability
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, math.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 9e-4, 1.1e-3, 1.0, math.pi / 2, math.pi - 1e-7, math.pi])
 def test_errors_of_a_known_motion(angle, random_rotations):
     base = random_rotations(50, seed=1)
-    estimate = Pose(
-        random_rotations(50, angle=angle, seed=2) @ base, torch.tensor([[1.0, 2, 3]]).double().expand(50, 3)
-    )
-    errors = pose_errors(estimate, Pose(base, torch.tensor([[1.0, 5, 7]]).double().expand(50, 3)))
+    here, there = torch.tensor([[1.0, 2, 3], [1, 5, 7]], dtype=torch.float64).unsqueeze(1).expand(2, 50, 3)
+    estimate, truth = Pose(random_rotations(50, angle=angle, seed=2) @ base, here), Pose(base, there)
+    errors = pose_errors(estimate, truth)
     expected = torch.full((50,), math.degrees(angle), dtype=torch.float64)
     torch.testing.assert_close(errors.rotation_error_deg, expected, rtol=0, atol=1e-12)
     torch.testing.assert_close(errors.translation_error, torch.full((50,), 5.0).double())
+    single = pose_errors(*(Pose(*(x.float() for x in pose)) for pose in (estimate, truth))).rotation_error_deg
+    torch.testing.assert_close(single, expected.float(), rtol=1e-2, atol=1e-4)  # small angles are kept, too
 
 
 def test_success_needs_both_and_is_strict():
@@ -72,32 +70,6 @@ def test_chances_that_come_true_have_no_calibration_error():
 def test_reliability_needs_as_many_outcomes_and_a_range(chances, outcomes, ranges):
     with pytest.raises(ERRORS):
         reliability(torch.rand(chances), torch.ones(outcomes).bool(), ranges)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30, -1e-30])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_errors_of_any_numbers(value, dtype, random_rotations):
-    """An angle is in [0, 180] degrees or NaN, and no pose with NaN succeeds."""
-    truth = Pose(random_rotations(4).to(dtype), torch.zeros(4, 3, dtype=dtype))
-    estimate = Pose(truth.rotation.clone(), truth.translation.clone())
-    estimate.rotation[0, 1, 1], estimate.translation[1, 0] = value, value
-    errors = pose_errors(estimate, truth)
-    assert all(x.shape == (4,) and x.dtype == dtype for x in errors)
-    assert not ((errors.rotation_error_deg < 0) | (errors.rotation_error_deg > 180.001)).any()
-    right = success(errors)
-    assert right[2:].all()
-    assert not right[errors.rotation_error_deg.isnan() | errors.translation_error.isnan()].any()
-    assert 0 <= success_rate(right).low <= success_rate(right).rate <= success_rate(right).high <= 1
-    for refused in (right[:0], right.double()):
-        with pytest.raises(ValueError, match="at least one"):
-            success_rate(refused)
-
-
-@pytest.mark.parametrize(("rotation", "translation"), [((1, 3, 3), (2, 3)), ((2, 3, 3), (1, 3)), ((3, 3), (3,))])
-@pytest.mark.parametrize("function", [pose_errors, pose_distances])
-def test_poses_that_do_not_fit_are_an_error(function, rotation, translation):
-    with pytest.raises(BaseError):
-        function(Pose(torch.zeros(rotation), torch.zeros(translation)), Pose(torch.zeros(2, 3, 3), torch.zeros(2, 3)))
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1e30])

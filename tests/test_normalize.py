@@ -1,7 +1,5 @@
 """Laws of the normalisation: it can be undone, projections stay consistent, and nothing that is not there matters."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest
@@ -108,7 +106,7 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
         assert Normalize()(points.to(dtype), pixels, K)[1].valid.all(), (shape, offset, unit)
 
 
-# --- views ----------------------------------------------------------------------------------------------------------
+# --- views ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", [True, False])

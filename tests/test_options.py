@@ -1,7 +1,5 @@
 """Options of all constructors: any option works or is refused with an error of ours, and nonsense is named."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from functools import partial
@@ -17,6 +15,7 @@ from strategies import ANY, BOOL, COUNTS, RANGES, WORD, Seen, are_rotations, fin
 from kornia_pnpnet import MLPInit, Normalize, PnPNet, PoseLoss, RobustWeightedLM, SetInit, SetLoss, create_solver
 from kornia_pnpnet.data import (
     BoxPoints,
+    CameraProblems,
     DrivePoints,
     FacadePoints,
     MixedPoints,
@@ -27,6 +26,7 @@ from kornia_pnpnet.data import (
     SyntheticProblems,
     VaryingSize,
 )
+from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import SubsetSolver
@@ -193,6 +193,10 @@ REFUSED = [
     (SyntheticProblems, {"degrees": 0.5, "sigma_spread": 4.0, "bunched_share": -0.1, "half_image": -1.0}),
     (SyntheticProblems, {"img_sigma": -1.0, "world_sigma": (0.0, 1.0)}),
     (SyntheticProblems, {"img_sigma": (2.0, 1.0), "world_sigma": (1.0, 2.0, 3.0)}),
+    (CameraProblems, {"n": 0, "field_of_view": (90.0, 30.0), "outlier_share": 2.0, "cameras": 0}),
+    (CameraProblems, {"field_of_view": (0.0, 30.0)}),
+    (KnownInliersAndNoise, {"img_sigma": -1.0}),
+    (partial(KnownInliersAndNoise, world_sigma=0.0), {"img_sigma": 0.0}),
     (partial(SceneProblems, make_scene(20)), {"n": 0, "batch_size": 0, "num_spares": 0}),
 ]
 

@@ -1,7 +1,5 @@
 """Solvers of other libraries keep the contract of our solvers."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np
@@ -9,18 +7,17 @@ import pytest
 import torch
 from helpers import assert_same, reprojection_errors
 from kornia.core.exceptions import BaseError
+from laws import OPENCV, PEERS
 
 from kornia_pnpnet import create_solver, pose_errors, success, success_rate
-from kornia_pnpnet.core.trees import iter_tensors, take
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, PeerPose, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.result import PnPResult, Problems
 
 pytest.importorskip("cv2")
 
-NOT_ROBUST = ("opencv-sqpnp", "opencv-epnp")
-ROBUST = ("opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap")
-PEERS = NOT_ROBUST + ROBUST
+ROBUST = tuple(name for name in PEERS if name not in OPENCV)
 
 
 def make(name: str, **options) -> PeerSolver:
@@ -38,7 +35,7 @@ def solve(solver, problems: Problems, **extra) -> PnPResult:
 @pytest.mark.parametrize("name", PEERS)
 def test_clean_problems_are_solved_exactly(name, n, make_problems):
     problems = make_problems(n=n, batch=20, noise=False)
-    result = solve(make(name, **({} if name in NOT_ROBUST else {"threshold": 1.0})), problems)
+    result = solve(make(name, **({} if name in OPENCV else {"threshold": 1.0})), problems)
     errors = pose_errors(result.pose, problems.pose)
     exact = (errors.rotation_error_deg < 1e-3) & (errors.translation_error < 1e-3)
     assert result.ok.all()
@@ -102,34 +99,6 @@ def test_refining_keeps_the_ransac_pose_as_init(make_problems):
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_bad_problems_fail_alone(name, make_problems):
-    problems = make_problems(batch=12)
-    solver = make(name)
-    good = solve(solver, problems)
-    spoilt = problems.map(torch.clone)
-    spoilt.world_points[0, 3, 1] = torch.nan
-    spoilt.img_points[1, 0, 0] = torch.inf
-    spoilt.intrinsics[2, 0, 0] = torch.nan
-    spoilt.intrinsics[3, 1, 1] = 0.0
-    spoilt.intrinsics[4, 0, 1] = 5.0
-    spoilt.world_points[5] = spoilt.world_points[5, :1]
-    spoilt.world_points[6] = 1e300
-    spoilt.img_points[7] = 0.0
-    result = solve(solver, spoilt)
-    bad, others = slice(0, 5), slice(8, None)
-    assert not result.ok[bad].any()
-    assert name == "opencv-epnp" or not result.ok[5:7].any()  # OpenCV's EPnP finds a pose of any points
-    assert torch.equal(result.rotation[bad], torch.eye(3, dtype=torch.float64).expand(5, 3, 3))
-    assert (result.translation[bad] == 0).all()
-    assert (result.weights[bad] == 0).all()
-    assert all(part.isfinite().all() for part in iter_tensors(result))
-    assert result.ok[others].all()
-    assert torch.equal(result.probability, result.ok.double())
-    assert result.alternatives.probability.shape == (12, 0)
-    assert_same(take(result, others), take(good, others))
-
-
-@pytest.mark.parametrize("name", PEERS)
 def test_rubbish_of_any_size_neither_raises_nor_comes_back_infinite(name, generator):
     world = torch.randn(48, 8, 3, generator=generator, dtype=torch.float64)
     img = 1e3 * torch.randn(48, 8, 2, generator=generator, dtype=torch.float64)
@@ -161,19 +130,13 @@ def test_absent_pairs_do_not_matter(name, make_problems):
         assert_same(result._replace(weights=result.weights[:, :9], inliers=result.inliers[:, :9]), expected)
 
 
-def test_too_few_pairs_and_bad_weights_fail_without_an_error(make_problems):
+def test_too_few_pairs_bad_weights_and_a_skew_fail_without_an_error(make_problems):
+    skewed = make_problems(batch=4).map(torch.clone)
+    skewed.intrinsics[2, 0, 1] = 5.0
+    assert solve(OpenCVRansac(), skewed).ok.tolist() == [True, True, False, True]
     assert not solve(OpenCVRansac(), make_problems(n=3, batch=4)).ok.any()
     weights = torch.tensor([-1.0, torch.nan, 1.0]).double()[:, None].expand(3, 9)
     assert solve(OpenCVRansac(), make_problems(batch=3), weights=weights).ok.tolist() == [False, False, True]
-
-
-@pytest.mark.parametrize("name", ROBUST)
-def test_results_do_not_depend_on_earlier_problems(name, make_problems):
-    problems = make_problems(batch=20, outliers=3)
-    solver = make(name)
-    together = solve(solver, problems)
-    assert_same(solve(solver, problems), together)
-    assert torch.equal(solve(solver, problems.map(lambda part: part[-1:])).rotation, together.rotation[-1:])
 
 
 FEW = {"min_iterations": 2, "max_iterations": 4}
@@ -198,15 +161,13 @@ def test_options_reach_the_library(name, one, other, make_problems):
     assert "threshold" not in one or first.weights.sum() < 0.7 * second.weights.sum()
 
 
-def test_dtype_gradients_and_shared_camera(make_problems):
-    problems = make_problems(batch=4, dtype=torch.float32)
+def test_results_have_no_gradient_and_problems_may_share_a_camera(make_problems):
+    problems = make_problems(batch=4)
     world = problems.world_points.clone().requires_grad_()
     result = OpenCVRansac()(world, problems.img_points, problems.intrinsics[0])
-    assert {part.dtype for part in iter_tensors(result)} == {torch.float32, torch.bool, torch.int8}
     assert not any(part.requires_grad for part in iter_tensors(result))
+    assert torch.equal(result.probability, result.ok.double())
     assert_same(result, solve(OpenCVRansac(), problems))
-    failed = OpenCVRansac()(world.detach() * torch.nan, problems.img_points, problems.intrinsics)
-    assert failed.cost.isfinite().all()
 
 
 def test_options_that_poselib_would_ignore_are_an_error(monkeypatch):
@@ -225,7 +186,7 @@ def test_without_the_library_the_error_names_the_extra(peer, monkeypatch):
 
 @pytest.mark.parametrize("name", PEERS)
 def test_config_rebuilds_the_solver(name):
-    changed = {"method": "ITERATIVE"} if name in NOT_ROBUST else {"threshold": 7.0, "seed": 5}
+    changed = {"method": "ITERATIVE"} if name in OPENCV else {"threshold": 7.0, "seed": 5}
     solver = make(name, **changed)
     config = solver.config()
     assert changed.items() <= config.items()

@@ -4,8 +4,6 @@ The problems are drawn anew from the parameters of each suite; no data is taken 
 our solvers solves at least as many problems as the best peer, minus a margin.
 """
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -6,7 +6,7 @@ import pytest
 import torch
 from kornia.core.exceptions import BaseError
 
-from kornia_pnpnet import Pose, create_solver, p3p, pose_errors, success
+from kornia_pnpnet import Pose, Status, create_solver, p3p, pose_errors, success
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.judge.evidence import LEAST_PROBABILITY
 
@@ -90,7 +90,8 @@ def test_the_solutions_of_three_pairs(make_problems):
     plane = (problems.img_points - problems.intrinsics[:, None, :2, 2]) / problems.intrinsics[:, None, [0, 1], [0, 1]]
     every, valid = p3p(problems.world_points, plane)
     with torch.no_grad():
-        result = create_solver("pnpnet-set")(*problems[:3], alternatives=3)
+        result, other = (create_solver(x)(*problems[:3], alternatives=3) for x in ("pnpnet-set", "p3p-ransac"))
+    assert (torch.cat((result.status, other.status)) == Status.NOT_BELIEVED).all()
     answers = [(result.rotation, result.translation, torch.ones_like(result.ok))]
     found = result.alternatives
     answers += [(found.rotation[:, i], found.translation[:, i], found.valid[:, i]) for i in range(3)]

@@ -1,9 +1,8 @@
 """EPnP, EPPnP and REPPnP: exact on exact pairs, differentiable, and as successful as their papers and OpenCV."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from helpers import rate
 
 from kornia_pnpnet import Pose, create_solver, pose_errors, success
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -22,10 +21,6 @@ def flattened(p, thickness=0.0):
     bumps = torch.randn(p.img_points.shape[:2], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     cam_points = rays * (20.0 / (rays @ normal) * (1.0 + thickness * bumps))[..., None]
     return p._replace(world_points=(cam_points - p.pose.translation[:, None]) @ p.pose.rotation)
-
-
-def rate(result, p):
-    return success(pose_errors(result.pose, p.pose)).double().mean()
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -1,25 +1,24 @@
 """Laws of P3P: all solutions and nothing else, in any order and unit, for every problem of a batch alone."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from kornia.core.exceptions import ShapeError, TypeCheckError
-from kornia.geometry.conversions import normalize_points_with_intrinsics
-from strategies import are_rotations, finite, gradients_are_finite, many, numbers, rotations
+from strategies import are_rotations, finite
 
-from kornia_pnpnet import Pose, Status, create_solver
+from kornia_pnpnet import Pose
 from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.p3p import p3p
 from kornia_pnpnet.propose.p3p_rig import P3PRig
 
 DTYPES = (torch.float64, torch.float32)
 NEAR = 1e-6
+
+
+def rotations(batch, seed):
+    return random_poses(batch, torch.Generator().manual_seed(seed), max_angle=math.pi).rotation
 
 
 def seen(cam_points, generator):
@@ -168,33 +167,6 @@ def test_single_precision_solves_what_it_can(scene, unit):
     assert (found.valid.sum(-1) == exact.valid.sum(-1)).double().mean() > 0.99
 
 
-def test_wrong_arguments_raise():
-    shapes = ((2, 3, 3), (2, 4, 2), (3, 3, 2))
-    wrong = [(torch.zeros(shape), ShapeError) for shape in shapes] + [(torch.zeros(2, 3, 2).bool(), TypeCheckError)]
-    for plane_points, error in wrong:
-        with pytest.raises(error):
-            p3p(torch.zeros(2, 3, 3), plane_points)
-
-
-def test_all_poses_of_three_pixels_with_any_leading_dimensions():
-    """From pixels, as a user with three pairs has them."""
-    p = SyntheticProblems(n=3, batch_size=600, seed=3, img_sigma=0.0, world_sigma=0.0, dtype=torch.float64).batch(0)
-    plane_points = normalize_points_with_intrinsics(p.img_points, p.intrinsics)
-    whole = p3p(p.world_points, plane_points)
-    assert (errors(whole, p.pose).amin(-1) < NEAR).all()
-    for name in ("pnpnet-set", "p3p-ransac"):
-        assert (create_solver(name)(*p[:3]).status == Status.NOT_BELIEVED).all()
-    for size in ((), (1,), (2, 3), (0,), (5, 0), (4, 5, 6)):
-        first = math.prod(size)
-        found = p3p(p.world_points[:first].reshape(*size, 3, 3), plane_points[:first].reshape(*size, 3, 2))
-        assert found.valid.shape == (*size, 4)
-        assert found.pose.matrix.shape == (*size, 4, 4, 4)
-        flat = Hypotheses(Pose(*(x.flatten(0, len(size)) for x in found.pose)), found.valid.flatten())
-        expected = (x[:first].flatten(0, 1) for x in (*whole.pose, whole.valid))
-        for one, other in zip((*flat.pose, flat.valid), expected, strict=True):
-            assert torch.equal(one, other)
-
-
 @pytest.mark.parametrize("base", [0.0, 0.3, 3.0])
 @pytest.mark.parametrize("looks", ["ahead", "everywhere"])
 def test_three_pairs_of_a_rig(base, looks, generator):
@@ -214,12 +186,11 @@ def test_three_pairs_of_a_rig(base, looks, generator):
     assert (gap < 1e-9).double().mean() > 0.98
 
 
-@many(80)
-@given(st.data(), st.integers(0, 4), st.sampled_from([torch.float32, torch.float64]))
-def test_p3p_takes_anything(data, batch, dtype):
-    points = [data.draw(numbers(dtype, (batch, 3, size))).requires_grad_() for size in (3, 2)]
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_numbers_that_make_no_sense_have_finite_solutions(dtype):
+    values = torch.tensor([0.0, -1.0, 1e30, torch.inf, -torch.inf, torch.nan])
+    points = [x.to(dtype) for x in wide(36)[:2]]
+    points[0][:, 0, 0], points[1][:, 1, 1] = values.repeat(6), values.repeat_interleave(6)
     found = p3p(*points)
-    assert found.valid.shape == found.pose.rotation.shape[:2]
     are_rotations(found.pose.rotation[found.valid])
     finite(found)
-    gradients_are_finite(found.pose, points)

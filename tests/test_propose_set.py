@@ -1,4 +1,4 @@
-"""Laws of the set network: its invariances, its samples, its noise, and that a few training steps improve it."""
+"""The networks: samples, noise and training of the network of a set; layers and rotations of the paper's network."""
 
 import math
 import os
@@ -8,10 +8,13 @@ import sys
 
 import pytest
 import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import nn
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
+from kornia_pnpnet import MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.propose.mlp import rotation_about
 
 NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}
 
@@ -25,21 +28,6 @@ def solver(**options):
 def near(a, b, tolerance=1e-6):
     for mine, others in zip(a, b, strict=True):
         torch.testing.assert_close(mine, others, rtol=tolerance, atol=tolerance)
-
-
-def test_any_number_of_pairs_and_any_precision(make_problems, tmp_path):
-    net = solver(width=16, heads=2, starts=2)
-    net.save_pretrained(tmp_path)
-    single = PnPNet.from_pretrained(tmp_path)  # float32 weights take float64 pairs
-    single.effort = "fixed"
-    for n in (4, 5, 9, 50, 1000):
-        p = make_problems(n=n, batch=3)
-        result = net(*p[:3])
-        assert result.weights.shape == (3, n)
-        assert result.matrix.isfinite().all()
-        assert ((result.weights >= 0) & (result.weights <= 1)).all()
-        assert single(*p[:3]).rotation.dtype == torch.float64
-        near(single(*p[:3]).init, result.init, 1e-4)
 
 
 @pytest.mark.parametrize(("n", "outliers"), [(4, 0), (9, 0), (9, 4), (60, 0), (60, 50)])
@@ -144,3 +132,49 @@ def test_padding_changes_nothing_where_the_network_sees_some_pairs(make_problems
     mask = torch.arange(130).expand(20, 130) < 100
     net = PnPNet.from_pretrained("pnpnet-set").double().eval()
     near(net(*padded, p.intrinsics, mask=mask).pose, net(*p[:3]).pose)
+
+
+# --- the paper's network ----------------------------------------------------------------------------------------------
+
+
+def sizes(module):
+    return [(layer.in_features, layer.out_features) for layer in module if isinstance(layer, nn.Linear)]
+
+
+@pytest.mark.parametrize("n", [6, 12])
+def test_layers_are_the_papers(n):
+    net = MLPInit(n)
+    assert sizes(net.shared) == [(5 * n, 20 * n), (20 * n, 5 * n), (5 * n, 3 * n)]
+    branch = [(3 * n, 2 * n)] + 4 * [(2 * n, 2 * n)]
+    assert sizes(net.rotation) == [*branch, (2 * n, 4)]
+    assert sizes(net.translation) == [*branch, (2 * n, 3)]
+    # A ReLU after each layer, except the last layer of a branch.
+    for module, is_branch in ((net.shared, False), (net.rotation, True), (net.translation, True)):
+        assert [type(layer) for layer in module] == (len(sizes(module)) * [nn.Linear, nn.ReLU])[: len(module)]
+        assert isinstance(module[-1], nn.Linear) == is_branch
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_axis_and_angle_turn_as_kornias_rotation_vectors(dtype):
+    """Large and tiny angles, long and short axes; values and gradients."""
+    generator = torch.Generator().manual_seed(0)
+    axis = torch.randn(3, 400, generator=generator, dtype=torch.float64)
+    axis *= 10.0 ** torch.linspace(-1, 3, 20, dtype=torch.float64).repeat(20)
+    angle = 10.0 * torch.randn(400, generator=generator, dtype=torch.float64)
+    angle[:200] *= 10.0 ** torch.linspace(-12, 0, 200, dtype=torch.float64)
+    upstream = torch.randn(400, 3, 3, generator=generator, dtype=torch.float64).to(dtype)
+    outcomes = []
+    for at in (dtype, torch.float64):
+        leaves = [x.to(dtype).to(at).requires_grad_() for x in (axis, angle)]
+        if at == dtype:
+            rotation = rotation_about(*leaves)
+        else:
+            floor = torch.finfo(dtype).eps
+            length = (leaves[0].square().sum(0) + floor).sqrt()
+            rotation = axis_angle_to_rotation_matrix((leaves[0] / length * leaves[1]).mT)
+        by_axis, by_angle = torch.autograd.grad(rotation, leaves, upstream.to(at))
+        size = leaves[0].detach().norm(dim=0)  # the gradient by the axis is inverse to it
+        outcomes.append([x.to(torch.float64) for x in (rotation, by_axis * size, by_angle)])
+    tolerance = 2e-5 if dtype == torch.float32 else 1e-12
+    for mine, kornias in zip(*outcomes, strict=True):
+        torch.testing.assert_close(mine, kornias, rtol=tolerance, atol=20 * tolerance)

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from data_helpers import table
 
 from kornia_pnpnet.data import SyntheticProblems
 
 pytest.importorskip("ray", reason="needs the extra scale")
 pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
-from kornia_pnpnet.arrow import Solve, list_column  # noqa: E402
+from kornia_pnpnet.arrow import Solve  # noqa: E402
 
 pytestmark = pytest.mark.slow
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
@@ -80,10 +81,8 @@ def start(tmp_path):
     (tmp_path / "workers.py").write_text(WORKERS)
     for i in range(FILES):
         drawn = SyntheticProblems(n=9, batch_size=ROWS, seed=i, dtype=torch.float32).batch(0)
-        names = ("world_points", "img_points", "intrinsics")
-        columns = {name: list_column(x.numpy()) for name, x in zip(names, drawn[:3], strict=True)}
-        table = pa.table({"id": np.arange(i * ROWS, (i + 1) * ROWS), **columns})
-        parquet.write_table(table, tmp_path / "in" / f"{i}.parquet")
+        rows = pa.array(np.arange(i * ROWS, (i + 1) * ROWS))
+        parquet.write_table(table(drawn).add_column(0, "id", rows), tmp_path / "in" / f"{i}.parquet")
     paths = os.pathsep.join([str(tmp_path), str(EXAMPLES), os.environ.get("PYTHONPATH", "")])
     variables = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "RAY_USAGE_STATS_ENABLED": "0"}
     command = [sys.executable, "-c", SCRIPT, str(tmp_path / "in"), str(tmp_path / "out")]

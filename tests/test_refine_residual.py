@@ -1,7 +1,5 @@
 """Laws of the residual, its normal equations, the retraction and the rotation angle."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -15,13 +13,11 @@ from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.problem import Noise, Problem, State
 from kornia_pnpnet.refine import residual
 from kornia_pnpnet.refine.residual import (
-    moved,
     normal_equations,
     pixel_covariance,
     pixel_variance,
     project,
     retract,
-    rotation_angle,
 )
 
 FOCAL, RADIAL = 3400.0, torch.tensor([[0.05, -0.02]], dtype=torch.float64)
@@ -72,20 +68,6 @@ def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, rand
         assert ((found.gradient - gradient) / size).abs().max() < 1e-8 * FOCAL
 
 
-def test_a_zoom_keeps_the_image_of_the_origin(random_rotations):
-    """Its pixel and its scale; the coefficients of distortion add up."""
-    state, problem = scene("pixels", 2, random_rotations(7))
-    state = state._replace(camera=0.0 * state.camera)
-    delta = torch.zeros(8, 7, dtype=torch.float64)
-    delta[6], delta[7] = 0.2, 0.1
-    zoomed = moved(state, delta)
-    torch.testing.assert_close(zoomed.camera, torch.tensor([[0.2, 0.1]], dtype=torch.float64).expand(7, 2))
-    scales = [project(x, problem).focal / x.pose.translation[:, 2] for x in (state, zoomed)]
-    torch.testing.assert_close(*scales)
-    assert zoomed.pose.translation[:, :2].equal(state.pose.translation[:, :2])
-    assert zoomed.pose.rotation.equal(state.pose.rotation)
-
-
 def test_points_behind_the_camera_have_finite_gradients():
     world = torch.tensor([[[1.0, 2.0, z] for z in (-1.0, 0.0, 1e-30, 5.0)]], requires_grad=True)
     for unknown in (0, 3):
@@ -124,16 +106,6 @@ def test_retraction_by_anything_is_a_rotation_with_finite_gradients(length, dtyp
     assert (torch.linalg.det(there.rotation) > 0.5).all()
     there.rotation.sum().backward()
     assert delta.grad.isfinite().all()
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 9e-4, 1.1e-3, 1.0, math.pi / 2, math.pi - 1e-7, math.pi])
-def test_rotation_angle_of_a_known_turn(angle, random_rotations):
-    base, turn = random_rotations(200, seed=1), random_rotations(200, angle=angle, seed=2)
-    expected = torch.full((200,), angle, dtype=torch.float64)
-    for a, b in ((turn @ base, base), (base, turn @ base)):
-        assert_same(rotation_angle(a, b), expected, atol=2e-15)
-    if 1e-5 < angle < 3.0:  # float32 keeps small angles, too
-        assert_same(rotation_angle(turn.float(), torch.eye(3).expand(200, 3, 3)), expected.float(), rtol=1e-2)
 
 
 # --- noise ----------------------------------------------------------------------------------------------------------

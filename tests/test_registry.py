@@ -1,90 +1,16 @@
-"""Fuzz of solvers by name: shapes, dtypes, devices, scales, geometry without a pose."""
+"""Solvers by name: options of any kind, and the transforms of torch.func."""
 
-import copy
 import re
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.core.exceptions import DeviceError
-from strategies import ANY, COUNTS, ERRORS, SOLVERS, WORD, Seen, batches, check, finite, many, numbers, options
+from strategies import ANY, COUNTS, ERRORS, WORD, Seen, finite, many, options
 
-from kornia_pnpnet import Pose, create_solver, list_solvers
+from kornia_pnpnet import create_solver, list_solvers
+from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import SyntheticProblems
-
-PEERS = {name: create_solver(name) for name in ("opencv-ransac", "poselib")}
-
-
-@st.composite
-def calls(draw, n=None):
-    """Arguments of a solver by name, some of them missing, and what is wrong with each problem."""
-    (world, img, camera), mask, weights, kinds = draw(batches(n))
-    batch, count = world.shape[:2]
-    if draw(st.booleans()):
-        weights = draw(numbers(world.dtype, (batch, count)))
-        # The first pair is the one that is spoiled.
-        kinds = ["nothing" if weight == 0 else kind for kind, weight in zip(kinds, weights[:, 0], strict=True)]
-    if mask is not None and batch and draw(st.booleans()):
-        mask[0] = False  # no pair of the first problem
-        kinds[0] = "one point"
-    sigma = st.none() | numbers(world.dtype, (), (batch,), (batch, count))
-    translation = 10.0 * torch.randn(batch, 3, generator=torch.Generator().manual_seed(batch))
-    init = Pose(torch.eye(3, dtype=world.dtype).expand(batch, 3, 3), translation.to(world.dtype))
-    call = {"world_points": world, "img_points": img, "intrinsics": camera, "weights": weights, "mask": mask}
-    call |= {"init": draw(st.sampled_from([None, init])), "img_sigma": draw(sigma), "world_sigma": draw(sigma)}
-    return {name: value for name, value in call.items() if value is not None}, kinds
-
-
-@pytest.mark.parametrize("name", SOLVERS)
-def test_solvers_take_anything(name):
-    @many(50)
-    @given(calls(9 if name.endswith("-n9") else None))
-    def run(case):
-        call, kinds = case
-        check(SOLVERS[name](**call), list(call.values())[:3], kinds)
-
-    run()
-
-
-#: ``meta`` has shapes and no values: whoever looks at one, or makes a tensor somewhere else, raises there.
-DEVICES = ["meta", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-GRAPHS = [name for name in SOLVERS if name != "p3p-ransac"]  # RANSAC looks at values
-
-
-def moved(call, device, names):
-    """Some of the tensors on another device."""
-    pose = {name: Pose(*(x.to(device) for x in call[name])) for name in names if name == "init"}
-    return {**call, **{name: call[name].to(device) for name in names if name != "init"}, **pose}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", GRAPHS)
-def test_solvers_stay_where_their_inputs_are(name):
-    solvers = {device: copy.deepcopy(SOLVERS[name]).to(device) for device in DEVICES}
-
-    @many(15)
-    @given(st.sampled_from(DEVICES), calls(9 if name.endswith("-n9") else None))
-    def run(device, case):
-        call, _ = case
-        result, guess = solvers[device].with_starts(**moved(call, device, call))
-        expected = SOLVERS[name](**call)
-        for ours, there in zip((*result[:5], *result.init), (*expected[:5], *expected.init), strict=True):
-            assert ours.device.type == guess.weights.device.type == device
-            assert (ours.shape, ours.dtype) == (there.shape, there.dtype)
-
-    run()
-
-
-@many(80)
-@given(st.sampled_from([*SOLVERS, *PEERS]), st.sampled_from(DEVICES), calls(9), st.data())
-def test_inputs_on_different_devices_are_an_error_of_ours(name, device, case, data):
-    call = dict(list(case[0].items())[:3]) if name in PEERS else case[0]
-    names = data.draw(st.lists(st.sampled_from(list(call)), min_size=1, max_size=len(call) - 1, unique=True))
-    with pytest.raises(DeviceError, match=f"on {device}"):
-        {**SOLVERS, **PEERS}[name](**moved(call, device, names))
 
 
 def test_solvers_of_any_name_and_options():
@@ -102,6 +28,14 @@ def test_solvers_of_any_name_and_options():
 
     run()
     made.both()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac"])
+def test_solvers_stay_where_their_inputs_are(name, make_problems):
+    p = make_problems(dtype=torch.float32).map(lambda x: x.cuda())
+    result, starts = create_solver(name).cuda().with_starts(*p[:3])
+    assert {x.device.type for x in iter_tensors((result, starts.weights))} == {"cuda"}
 
 
 # --- torch.func -------------------------------------------------------------------------------------------------------

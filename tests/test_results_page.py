@@ -1,17 +1,11 @@
 """The results page follows from its files, and its verdicts from intervals."""
 
-from __future__ import annotations
-
-import sys
-from pathlib import Path
-
 import pytest
 
 pytest.importorskip("pandas")
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "docs" / "results"))
 import matches
 import render
 from rates import compared

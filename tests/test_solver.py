@@ -1,7 +1,5 @@
 """What the laws of ``laws.py`` do not say of solvers: effort, confidence, gradients, given poses, saving and views."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from helpers import assert_same, rate
@@ -21,7 +19,6 @@ from kornia_pnpnet import (
     Status,
     create_solver,
     pose_errors,
-    solve_pnp,
 )
 from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
@@ -257,14 +254,6 @@ def test_a_given_matrix_that_is_no_rotation_is_ignored(factor, make_problems):
     assert (create_solver("identity-lm", m=0)(*p[:3], init=given).status == Status.INIT).all()
 
 
-def test_integers_are_numbers(make_problems):
-    p = make_problems()
-    inputs = [x.round().float() for x in (100.0 * p.world_points, p.img_points, p.intrinsics, torch.ones(7, 9))]
-    solver = create_solver("epnp-lm")
-    assert_same(solver(*(x.long() for x in inputs)), solver(*inputs))
-    assert solve_pnp(*(x.long() for x in inputs), solver=solver).dtype == torch.float32
-
-
 def test_known_noise_solves_more(make_problems, perturb):
     """From near the truth, with outliers: weights of known noise beat weights of residuals alone."""
     p = make_problems(batch=1000, outliers=3)
@@ -317,15 +306,12 @@ def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, m
     assert_same(again(*p[:3]), solver(*p[:3]))
 
 
+#: What a random damage, of which ``test_interruptions.py`` tries many, does not do.
 DAMAGES = [
-    lambda config, weights: weights.write_bytes(weights.read_bytes()[:-100]),
-    lambda config, weights: weights.write_bytes(b""),
     lambda config, weights: torch.save({"a": torch.zeros(1)}, weights),
     lambda config, weights: weights.unlink(),
     lambda config, weights: save_file({"linear.weight": torch.zeros(2, 2)}, weights),
-    lambda config, weights: config.write_text("{n: 9"),
     lambda config, weights: config.write_text("[1, 2]"),
-    lambda config, weights: config.write_bytes(b"\xff\xfe\x00"),
     lambda config, weights: config.write_text(config.read_text().replace("cauchy", "huber")),  # of other weights
 ]
 

@@ -16,6 +16,7 @@ from helpers import assert_same
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
+from measure import collect_weights
 from omegaconf import OmegaConf
 
 from kornia_pnpnet import PnPNet
@@ -24,10 +25,6 @@ from kornia_pnpnet.training.checkpoint import History
 from kornia_pnpnet.training.results import load_run
 
 REPO = Path(__file__).resolve().parents[1]
-sys.path.append(str(REPO / "docs" / "results"))
-
-from measure import collect_weights  # noqa: E402
-
 DATA = sorted(path.stem for path in (REPO / "conf" / "data").glob("*.yaml"))
 EXPERIMENTS = {path.stem: path for path in sorted((REPO / "conf" / "experiment").glob("*.yaml"))}
 

@@ -15,7 +15,6 @@ REPO = Path(__file__).resolve().parents[1]
 PATCHES = sorted((REPO / "docs" / "upstream").glob("*.patch"))
 INSTALLED = Path(kornia.__file__).parent
 CHANGED = Path("kornia") / "geometry" / "calibration"
-sys.path.insert(0, str(REPO / "benchmarks"))  # the benchmarks are scripts and import each other
 
 # What Kornia's tests need of its repository and the wheel does not have, in our words.
 CONFTEST = """
