@@ -29,15 +29,14 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3PRig"]
 
-# Number of distances at which a function is evaluated. Two solutions between neighbouring distances are missed. If
-# cameras look in all directions, 16 distances miss 4 % of the poses, and 32 distances miss 2 % (random exact samples).
+# Number of distances at which a function is evaluated. Two solutions between neighbouring distances are missed: 4 % of
+# the poses if cameras look in all directions.
 _DISTANCES = 16
 # Largest number of solutions, and number of Newton steps.
 _SOLUTIONS, _STEPS = 8, 6
-# A pose is a solution when the relative error of each side of the triangle is below this number.
-_EXACT = 1e-3
-# Largest difference of the product of the transposed and the rotation matrix from the identity.
-_ORTHOGONAL = 0.01
+# A pose is a solution when the relative error of each side of the triangle, and the difference of the product of the
+# transposed and the rotation matrix from the identity, are below these numbers.
+_EXACT, _ORTHOGONAL = 1e-3, 0.01
 
 
 class _Branches(NamedTuple):

@@ -18,6 +18,7 @@ from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.sampling import spread_evenly
+from kornia_pnpnet.propose.scoring import as_entries, as_pose
 from kornia_pnpnet.propose.view import LEAST_NOISE, LOG_NOISE, View, repeats
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO, project
 from kornia_pnpnet.result import Pose
@@ -26,8 +27,7 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Number of features of a pair: 3 coordinates of the point, 2 of the pixel, 2 residuals, 3 features of the problem, 2
-# logarithms of noise and 2 flags. Confidences and repeats add 2 features each, see `View`.
+# Number of features of a pair, without confidences and repeats, see `View`.
 _FEATURES = 14
 # The softmax is computed over rows of at least this number of pairs. PyTorch 2.13 is slow for shorter rows.
 _SHORT = 16
@@ -42,19 +42,15 @@ _SPREADS = ((18, 3), (24, 4), (30, 5))
 # Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two of them share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
-# The 32 likeliest pairs score each hypothesis.
-_MOST_JUDGES = 32
+# This number of the likeliest pairs scores each hypothesis. A squared residual of the second number of variances halves
+# the score of a pair. The third number is the score of a pair of likelihood 0, relative to a pair of likelihood 1.
+_MOST_JUDGES, _JUDGED, _LEAST_VOTE = 32, 50.0, 0.5
 # If the minimal samples have more slots than this number, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
-# A squared residual of this number of variances halves the score of a pair.
-_JUDGED = 50.0
-# The noise of points is converted to pixels at the depth of the world's centre, or at this depth
-# (normalised units) if the centre is closer.
+# Normalised units. Least depth at which the noise of points is converted to pixels.
 _LEAST_DEPTH = 0.5
-# Score of a pair with the likelihood 0, relative to the score of a pair with the likelihood 1.
-_LEAST_VOTE = 0.5
-# Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches (`raw/by_image.npz`, see
-# docs/results) and random problems of up to 1000 pairs, 32 to 96 pairs have the same success as all pairs.
+# Before a search the network sees at most this number of pairs; the search uses all pairs. On real matches and random
+# problems of up to 1000 pairs, 32 to 96 pairs have the same success as all pairs.
 _ENOUGH = 48
 
 
@@ -62,9 +58,8 @@ def _taken(tree: _T, index: Tensor) -> _T:
     """Select the pairs at positions (B, K) in each tensor (B, N, ...) of pairs. Other tensors do not change."""
 
     def take(x: Tensor) -> Tensor:
-        if x.ndim < 2 or x.shape[1] <= index.shape[1]:
-            return x
-        return x.gather(1, index if x.ndim == 2 else index[..., None].expand(-1, -1, x.shape[2]))
+        of_pairs = x.ndim > 1 and x.shape[1] > index.shape[1]
+        return x.take_along_dim(index if x.ndim == 2 else index[..., None], 1) if of_pairs else x
 
     return map_tensors(take, tree)
 
@@ -85,7 +80,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 
 
 def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
-    """Minimal samples as ranks of three pairs, each after the least number of pairs of a problem that uses it."""
+    """Minimal samples as ranks of three pairs, each after the least number of pairs of a problem that uses them."""
     likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if search_follows:  # the search draws further samples
         return likeliest
@@ -105,11 +100,12 @@ def _sample_table(count: int, number: int, search_follows: bool, device: torch.d
         return torch.tensor(samples, device=device).mT.flatten(), torch.tensor(least, device=device)[:, None]
 
 
-def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
-    """Scores (H, B) of rotations (3, 3, H, B) and translations (3, H, B). The pairs ``judges`` (7, K, B) score."""
+def _support(poses: Tensor, judges: Tensor) -> Tensor:
+    """Scores (H, B) of poses [R | t] (3, 4, H, B) by the pairs ``judges`` (7, K, B)."""
     a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
-    points = torch.addcmul(translation[:, :, None], rotation[:, 0, :, None], a)  # (3, H, K, B)
-    x, y, z = points.addcmul_(rotation[:, 1, :, None], b).addcmul_(rotation[:, 2, :, None], c).unbind()
+    first, second, third, translation = poses[:, :, :, None].unbind(1)  # (3, H, 1, B) each
+    points = torch.addcmul(translation, first, a)  # (3, H, K, B)
+    x, y, z = points.addcmul_(second, b).addcmul_(third, c).unbind()
     across = torch.addcmul(x * x, y, y)
     front = (z * z.abs()).mul_(1.0 - MIN_DEPTH_RATIO**2) > MIN_DEPTH_RATIO**2 * across
     inverse = z.reciprocal()
@@ -140,8 +136,7 @@ class _Block(nn.Module):
         values, scores = self.look.weight.split((width, heads))
         # The scores have no bias, because the softmax over pairs cancels a bias.
         attention = _attention(y, scores, absent).movedim(0, 1)  # (B, heads, N)
-        # The values are linear in y, so that the mean of the values follows from the mean of y. One matrix product per
-        # problem and head replaces one per pair.
+        # The values are linear in y, so that the mean of the values follows from the mean of y.
         means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
         bias = self.look.bias[:width].view(heads, 1, -1)
         context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).reshape(batch, width)
@@ -169,16 +164,15 @@ class SetInit(Initialiser):
     point from the camera. The pose is the rigid motion that aligns the world points with the points at these distances.
     Poses are equivariant to similarity transforms of the world, and to rotations of the camera except the roll.
 
-    The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`). The 32
-    likeliest pairs score the poses of the samples. The best pose is a further hypothesis, and has no gradient.
+    The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`), and score the
+    poses of the samples. The best pose is a further hypothesis, and has no gradient.
 
     The weight of a pair is the estimated probability that the pair is an inlier. The network also estimates unknown
     noise. The layers compute in the dtype of the network's weights, all other operations in that of the pairs.
 
-    The design is ours. From the literature are distances along rays followed by alignment (J. Hesch and S. Roumeliotis,
-    "A direct least-squares method for PnP", ICCV 2011), attention pooled over correspondences (W. Sun et al., "ACNe:
-    Attentive context normalization for robust permutation-equivariant learning", CVPR 2020), and the samples (P.
-    Turán's problem for (6, 4, 3), 1941).
+    Sources: J. Hesch and S. Roumeliotis, "A direct least-squares method for PnP", ICCV 2011 (distances along rays, then
+    alignment); W. Sun et al., "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR
+    2020 (attention pooled over correspondences); P. Turán's problem for (6, 4, 3), 1941 (the samples).
 
     Args:
         width: number of channels of each pair.
@@ -244,8 +238,8 @@ class SetInit(Initialiser):
         Args:
             problem: pairs in any order. The world is centred and scaled.
             search_follows: whether :func:`~kornia_pnpnet.propose.ransac.search_on` follows. The network then sees at
-                most 48 pairs, and solves fewer samples. The weight of a pair that the network does not see is the
-                agreement of the pair with the last hypothesis.
+                most 48 pairs, and solves fewer samples. The agreement of each other pair with the last hypothesis is
+                its weight.
 
         Returns:
             The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
@@ -289,15 +283,13 @@ class SetInit(Initialiser):
         """The pose with the best score of all minimal samples, or ``fallback`` if no sample has a valid pose."""
         batch, count = chances.shape
         there = problem.usual_weights > 0
-        # Unlikely pairs also contribute to scores, because they can be inliers. Padding does not contribute.
+        # Unlikely pairs also contribute to scores, because they can be inliers.
         vote = torch.add((1.0 - _LEAST_VOTE) * chances, there, alpha=_LEAST_VOTE)
         # The variance is computed at the depth of the network's pose. At the depth of a hypothesis close to the points,
         # the variance would be large, and most pairs would agree with the hypothesis.
         precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, fallback))
-        plane_points = problem.img_points / problem.focal
-        of_pairs = torch.cat(
-            (problem.world_points, plane_points, vote[..., None], precision[..., None]), -1
-        )  # (B, N, 7)
+        plane_points, scoring = problem.img_points / problem.focal, (vote[..., None], precision[..., None])
+        of_pairs = torch.cat((problem.world_points, plane_points, *scoring), -1)  # (B, N, 7)
         if not isinstance(count, int):  # exported for any number of pairs: append padding
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1), dtype=vote.dtype, device=vote.device)
             of_pairs = torch.cat((of_pairs, more.expand(-1, _MOST_JUDGES, -1)), 1)
@@ -312,30 +304,23 @@ class SetInit(Initialiser):
             places, enough = _sample_table(count, self.samples, search_follows, pairs.device)
             three = pairs[:6].index_select(1, places)
         three = three.unflatten(1, (3, -1)).flatten(2)  # (6, 3, S B)
-        pose, valid = minimal_poses(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
-        # In memory, the result of p3p has the dimensions: components, solutions, samples, problems.
+        entries, valid = minimal_poses(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))
         each = enough.shape[0], batch
-        rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
-        rotation = rotation.flatten(0, 1)  # (9, H, B)
-        valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
+        entries = entries.unflatten(-1, each).flatten(1, 2)  # (12, H, B)
+        valid = (valid & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
         if not search_follows and count >= _SPREADS[0][0]:  # padding does not count as pairs
             valid = valid & (there.sum(1) >= enough)
         valid = valid.flatten(0, 1)  # (H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
             slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT
-            rotation, translation = (x.gather(1, slots.expand(len(x), -1, -1)) for x in (rotation, translation))
-            valid = valid.gather(0, slots)
-        matrices = rotation.unflatten(0, (3, 3))
-        support = _support(matrices, translation, pairs)
+            entries, valid = entries.gather(1, slots.expand(12, -1, -1)), valid.gather(0, slots)
+        support = _support(entries.unflatten(0, (3, 4)), pairs)
         valid = valid & (support > 0)
         if problem.prior is not None:
-            poses = Pose(matrices.permute(2, 3, 0, 1), translation.permute(1, 2, 0))  # (H, B, ...)
-            support = support - problem.prior.disagreement(poses)
+            support = support - problem.prior.disagreement(as_pose(entries.permute(1, 2, 0)))
         score, best = torch.where(valid, support, -torch.inf).max(0)
-        every = torch.cat((rotation, translation)).gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
-        found = (score > -torch.inf)[:, None]
-        every = torch.where(found, every, torch.cat((fallback.rotation.flatten(1), fallback.translation), 1))
-        return Pose(every[:, :9].unflatten(1, (3, 3)), every[:, 9:])
+        chosen = entries.gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
+        return as_pose(torch.where((score > -torch.inf)[:, None], chosen, as_entries(fallback)))
 
     def _run(self, view: View) -> tuple[Tensor, Tensor]:
         """The outputs of the network for pairs (1 + 2 S, B, N), and for problems (B, S + 2)."""

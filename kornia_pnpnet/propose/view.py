@@ -12,8 +12,7 @@ from kornia_pnpnet.problem import Problem
 
 __all__ = ["LEAST_NOISE", "LOG_NOISE", "View", "repeats"]
 
-# Ridge of the affine camera, relative to the mean square of the world points. With the ridge, planar points have a
-# unique affine camera.
+# Ridge of the affine camera, relative to the mean square of the world points, so that it is unique for planar points.
 _RIDGE = 0.02
 # Features are clipped to this absolute value, so that no pair dominates the network.
 _MOST = 8.0
@@ -21,7 +20,7 @@ _MOST = 8.0
 LOG_NOISE = -5.0
 #: Least noise, as a share of the spread. Scores divide by the variance, which must not be 0.
 LEAST_NOISE = 1e-6
-# Confidences are clipped to at least this number and to at most 1 minus this number.
+# Least confidence, and least distance of a confidence from 1.
 _LEAST_CONFIDENCE = 1e-3
 
 
