@@ -39,11 +39,11 @@ __all__ = ["P3P", "minimal_poses", "p3p"]
 
 # Bytes of a vector that has one number per problem of a chunk. A core's caches hold a few dozen of these vectors.
 _CHUNK_BYTES = 2**16
-# A candidate is a solution if its triangle differs from the world triangle, whose longest edge is 1, by less than the
-# distance of the camera times the machine epsilon to the first power, and by less than the second number.
+# A candidate is a solution if its triangle differs from the world triangle, whose longest edge is 1, by less than
+# eps^_ERROR_POWER times the distance of the camera, and by less than _LARGEST_ERROR.
 _ERROR_POWER, _LARGEST_ERROR = 2 / 3, 0.01
-# Least distance of the camera from a point, in longest edges times the machine epsilon to the power `_ERROR_POWER`. At
-# a smaller distance, rounding would determine the ray of the point.
+# Least distance of the camera from a point, in units of eps^_ERROR_POWER longest edges. At a smaller distance, rounding
+# would determine the ray of the point.
 _CLOSE = 64.0
 # A triangle counts as a line when its height, over its size and its distance from the origin, is below this number of
 # machine epsilons.

@@ -29,9 +29,10 @@ CAUCHY = 3.4
 
 # Poses are compared and improved in this dtype. At a focal length of 3400 px, rounding errors are about 1e-4 px.
 _DTYPE = torch.float32
-# On a CPU, at most the first number of samples is solved and scored at once, so that the tensors fit into a core's
-# caches. A round has at most the second number of samples, and half as many samples as all rounds before.
-_SAMPLES_AT_ONCE, _LARGEST_ROUND, _GROWTH = 8192, 4096, 0.5
+# On a CPU, at most this number of samples is solved and scored at once, so that the tensors fit into a core's caches.
+_SAMPLES_AT_ONCE = 8192
+# Number of samples in a round, divided by the number of samples before the round, and its largest number.
+_GROWTH, _LARGEST_ROUND = 0.5, 4096
 # One round draws all remaining samples if they would take at most this number of rounds, or if they are few.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
 # After k samples, the first scoring of a round uses the maximum of the first number and the second number * k^(1/3)
