@@ -25,7 +25,7 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
-from kornia_pnpnet.result import Pose
+from kornia_pnpnet.propose.scoring import as_pose
 
 __all__ = ["P3PRig"]
 
@@ -98,15 +98,11 @@ class P3PRig:
         )
         ranges = torch.stack((start, *(x.at(start, sign) for x, sign in zip(branches, signs, strict=True))))
         rotation, translation, exact = _newton(world, rays, centres, sides, ranges)
-        eye = torch.eye(3, dtype=rays.dtype, device=rays.device)[..., None]
-        found = Hypotheses(
-            Pose(
-                eye.repeat(1, 1, _SOLUTIONS * batch).index_copy(-1, slots, torch.where(exact, rotation, eye)),
-                rays.new_zeros(3, _SOLUTIONS * batch).index_copy(-1, slots, torch.where(exact, translation, 0.0)),
-            ),
-            exact.new_zeros(_SOLUTIONS * batch).index_copy(0, slots, exact),
-        )
-        return map_tensors(lambda x: x.unflatten(-1, (_SOLUTIONS, batch)).movedim((-1, -2), (0, 1)), found)
+        identity = torch.eye(3, 4, dtype=rays.dtype, device=rays.device)[..., None]
+        found = torch.where(exact, torch.cat((rotation, translation[:, None]), 1), identity)
+        entries = identity.repeat(1, 1, _SOLUTIONS * batch).index_copy(-1, slots, found).flatten(0, 1)
+        valid = exact.new_zeros(_SOLUTIONS * batch).index_copy(0, slots, exact).view(_SOLUTIONS, batch)
+        return Hypotheses(as_pose(entries.unflatten(-1, valid.shape).permute(2, 1, 0)), valid.mT)
 
 
 def _starts(

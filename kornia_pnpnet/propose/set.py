@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import TypeVar
 
@@ -180,25 +181,25 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
     return noise.img.square() + (focal * noise.world / depth).square()
 
 
-def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
-    """Minimal samples as ranks of three pairs, each after the least number of pairs of a problem that uses them."""
-    likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
-    if search_follows:  # the search draws further samples
-        return likeliest
-    spread = [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in likeliest]
-    ring = [(_RING_FROM, sample) for sample in _RING]
-    return [(least, sample) for least, sample in (*likeliest, *spread, *ring) if least <= count]
+def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
+    """Minimal samples: least numbers of pairs of a problem that uses a sample (S), and ranks of the pairs (3 S)."""
+    every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
+    if not search_follows:  # a search draws further samples
+        every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
+        every += [(_RING_FROM, sample) for sample in _RING]
+    least, samples = zip(*(x for x in every if x[0] <= count), strict=True)
+    return least, [rank for ranks in zip(*samples, strict=True) for rank in ranks]
 
 
 @cache
 def _sample_table(count: int, number: int, search_follows: bool, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Positions (3 S,) and least numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
+    """Ranks (3 S,) and least numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
 
     A CUDA graph cannot contain a copy from the CPU.
     """
-    least, samples = zip(*_samples(count, number, search_follows), strict=True)
+    least, ranks = _samples(count, number, search_follows)
     with torch.inference_mode(False):  # later calls may need gradients
-        return torch.tensor(samples, device=device).mT.flatten(), torch.tensor(least, device=device)[:, None]
+        return torch.tensor(ranks, device=device), torch.tensor(least, device=device)[:, None]
 
 
 def _support(poses: Tensor, judges: Tensor) -> Tensor:
@@ -398,12 +399,12 @@ class SetInit(Initialiser):
         likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
         if compiling():  # compiled code is faster with `stack`
-            least, samples = zip(*_samples(count, self.samples, search_follows), strict=True)
+            least, ranks = _samples(count, self.samples, search_follows)
             enough = torch.tensor(least, device=there.device)[:, None]
-            three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
+            three = torch.stack([pairs[:6, rank] for rank in ranks], 1)
         else:
-            places, enough = _sample_table(count, self.samples, search_follows, pairs.device)
-            three = pairs[:6].index_select(1, places)
+            of_table, enough = _sample_table(count, self.samples, search_follows, pairs.device)
+            three = pairs[:6].index_select(1, of_table)
         three = three.unflatten(1, (3, -1)).flatten(2)  # (6, 3, S B)
         entries, valid = minimal_poses(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))
         each = enough.shape[0], batch
