@@ -166,7 +166,7 @@ def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
         projection = project(state, problem)
         seen, sq_residual = projection.in_front & (problem.weights > 0), projection.sq_residual
         sq_limit = (limit * projection.focal).square()[:, None]
-        sq_scale, _ = cauchy_scale(sq_residual, seen & (sq_residual <= CAUCHY**2 * sq_limit), MIN_PAIRS + 1)
+        sq_scale = cauchy_scale(sq_residual, seen & (sq_residual <= CAUCHY**2 * sq_limit), MIN_PAIRS + 1)
         sq_scale = sq_scale.nan_to_num(posinf=0.0).maximum(sq_limit)
         weights = torch.where(seen, 1.0 / (1.0 + sq_residual / sq_scale), 0.0)
         state = least_squares(problem, projection, weights, sq_scale / CAUCHY**2)

@@ -180,10 +180,11 @@ class RANSAC(Initialiser):
 
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
     """Weights (B, N) of a Cauchy kernel by the inliers' median residual, because thresholds are wide."""
-    sq_scale, count = cauchy_scale(errors, inliers > 0)
+    there = inliers > 0
+    sq_scale = cauchy_scale(errors, there).clamp(min=torch.finfo(errors.dtype).eps)
     # With few inliers, the median residual underestimates the noise. All weights are then closer to 1.
-    free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
-    return 1.0 / (1.0 + free * errors / sq_scale.clamp(min=torch.finfo(errors.dtype).eps))
+    count = there.sum(-1, keepdim=True, dtype=errors.dtype)
+    return 1.0 / (1.0 + (count - _FITTED).clamp(min=0) / count.clamp(min=1) * errors / sq_scale)
 
 
 _FURTHER = RANSAC(P3P(), min_samples=64)
@@ -201,7 +202,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
     A problem is searched only when it needs more than 64 samples for a confidence of 0.999, by the inliers of the best
-    pose of the starts, improved by least squares. The weight :math:`w` of a pair in the starts makes its chance to be
+    pose of the starts (improved by least squares). The weight :math:`w` of a pair in the starts makes its chance to be
     drawn proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
     A pair is an inlier if its residual is below ten standard deviations, or five if the caller gave the noise of the
@@ -223,10 +224,10 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.
     """
-    if starts.noise is None or starts.others is None:
-        raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')
     constant = map_tensors(torch.Tensor.detach, starts)
-    known, noise = problem.noise, map_tensors(torch.Tensor.detach, starts.noise)
+    known, noise = problem.noise, constant.noise
+    if noise is None or starts.others is None:
+        raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')
     problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
     depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)

@@ -344,10 +344,10 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
     return moved(projection.state, delta / -projection.focal)
 
 
-def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
-    """Squared scale (B, 1) of a Cauchy kernel, and number (B, 1) of pairs, for the arguments of `median_residual`."""
+def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
+    """Squared scale (B, 1) of a Cauchy kernel. The arguments are those of `median_residual`."""
     median = median_residual(sq_residuals, there, fitted)  # median / (2 log 2) is the variance of a coordinate
-    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, there.sum(-1, keepdim=True, dtype=median.dtype)
+    return CAUCHY**2 / (2.0 * math.log(2.0)) * median
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
