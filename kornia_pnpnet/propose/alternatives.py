@@ -31,7 +31,7 @@ _SAME = 0.035
 # A mirror image is refined if most residuals of the inliers are below this number times the spread of the pixels.
 _NEAR_MIRROR = 0.2
 # Rivals of other noise: least standard deviation in radians, first entry of the evidence's grid of noise that is tried,
-# largest loss of likelihood per pair, and largest share of inliers of a pose that has such a rival.
+# largest loss of log-likelihood per pair, and largest share of inliers of a pose that has such a rival.
 _WIDE_ANGLE, _WIDE_FROM, _GAP, _CLEAR = 6.4e-3, 4, 0.4, 0.9
 # The caller's rivals: factor by which the first variance is smaller, least angle from the pose, and largest share of
 # inliers of a pose that has such a rival.
