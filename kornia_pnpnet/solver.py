@@ -320,7 +320,7 @@ class PnPNet(PretrainedMixin):
         """Set an initial value of an unknown focal length, and return whether the initial value is nominal."""
         if self.focal == "known":
             return inputs, False
-        inputs = with_nominal_focal(inputs, self.focal_sigma)
+        inputs = with_nominal_focal(inputs, self.focal_sigma, self.radial)
         # A network's poses fit the nominal focal length. A caller's pose does not. After a search for doubted problems,
         # their refinement goes on by residual.
         given = inputs.init is not None or inputs.prior is not None

@@ -21,24 +21,22 @@ from kornia_pnpnet.result import Alternatives, Pose
 
 __all__ = ["find_alternatives", "reconsider"]
 
-# Another pose is kept when its likelihood is at least this fraction of the likelihood of the refinement's pose.
-_LIKELY = 1e-3
-# Upper bound of the logarithm of this likelihood ratio, so that the exponential does not overflow.
-_LIKELIER = 30.0
-# Radians, and share of a distance. Two poses are the same minimum if their rotations differ by less, and if the mean
-# point moves by less, relative to its distance from the camera.
+# Another pose is kept when its likelihood is at least this fraction of the likelihood of the refinement's pose. The
+# logarithm of this ratio is at most the second number, so that its exponential does not overflow.
+_LIKELY, _LIKELIER = 1e-3, 30.0
+# Two poses are the same minimum if their rotations differ by less than this number of radians, and if the mean point
+# moves by less than this share of its distance from the camera.
 _SAME = 0.035
 # A mirror image is refined if most residuals of the inliers are below this number times the spread of the pixels.
 _NEAR_MIRROR = 0.2
-# With a larger share of inliers, a pose has no rivals of other noise.
-_CLEAR = 0.9
-# Rivals of other noise: the factor of the variance, and the least standard deviation in radians.
-_WIDE_ANGLE, _WIDE_FROM, _GAP = 6.4e-3, 4, 0.4
+# Rivals of other noise: least standard deviation in radians, first entry of the evidence's grid of noise that is tried,
+# largest loss of log-likelihood per pair, and largest share of inliers of a pose that has such a rival.
+_WIDE_ANGLE, _WIDE_FROM, _GAP, _CLEAR = 6.4e-3, 4, 0.4, 0.9
 # The caller's rivals: factor by which the first variance is smaller, least angle from the pose, and largest share of
 # inliers of a pose that has such a rival.
 _SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.02, 0.97
-# Number of iterations of a rival at this noise, number of further iterations, and number of iterations from each start
-# of `find_alternatives`.
+# Number of iterations of a rival at its first noise, number of further iterations, and number of iterations from each
+# start of `find_alternatives`.
 _FROZEN, _FREE, _ITERATIONS = 3, 5, 12
 
 
@@ -223,9 +221,8 @@ def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor
     second = farthest(from_first)
     third = farthest(torch.linalg.cross(from_first, from_first[rows, second].expand_as(points)))
     index = torch.cat((first, second, third), 1)
-    solved = minimal_poses(points[rows, index], problem.img_points[rows, index] / problem.focal)
-    entries = torch.where(solved.valid[..., None], as_entries(solved.pose), as_entries(fallback)[:, None])
-    return entries.unbind(1)
+    entries, valid = minimal_poses(points[rows, index], problem.img_points[rows, index] / problem.focal)
+    return torch.where(valid[..., None], entries.permute(1, 2, 0), as_entries(fallback)).unbind()
 
 
 def _are_same(poses: Tensor, other: Tensor, middle: Tensor) -> Tensor:

@@ -36,8 +36,8 @@ _MIN_PAIRS, _MIN_IN_FRONT = 4, 3
 _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Size of a ridge, as a share of the squared spread of the pixels. Of null vectors with equal algebraic errors, those
-# along the longest extents of the world come first.
+# Ridge, as a share of the squared spread of the pixels. Of null vectors with equal algebraic errors, those along the
+# longest extents of the world come first.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
@@ -101,7 +101,7 @@ class EPnP(Initialiser):
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
     Four things differ. Two thirds of the unknowns are eliminated (see the module). Only the first null vector moves the
     centroid in depth. The objective does not depend on the choice of the control points, and includes the algebraic
-    error, which noisy null vectors do not share. Planar points use the same equations, with 0 as the last vector.
+    error. Planar points use the same equations, with 0 as the last vector.
 
     Four or five pairs can have up to four solutions. The solution with the least reprojection error may then be
     incorrect. A problem is not ``ok`` with fewer than four pairs, with points on a line, or with fewer than three pairs
@@ -111,8 +111,7 @@ class EPnP(Initialiser):
         iterations: number of Gauss-Newton steps, at least 2. Each case takes two steps, and the best case takes the
             remaining steps.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
-            distances. The world has a root mean square radius of 1, and pixels are divided by the focal length. The
-            paper's weight is 0.
+            distances, in a world of the root mean square radius 1. The paper's weight is 0.
 
     Raises:
         BaseError: when an argument is out of its range.

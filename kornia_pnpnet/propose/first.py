@@ -21,16 +21,14 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["propose"]
 
-# A pair that is not of normal scale is used only if its residual at some first pose is below this number of focal
-# lengths.
+# Focal lengths. A pair that is not of normal scale is used only if its residual at some first pose is smaller.
 _SEEN = 0.25
-# Inlier threshold for rigs, in focal lengths: 10 px at a focal length of 1000 px.
+# Inlier threshold for rigs, in focal lengths.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
 # With a fixed effort, RANSAC solves this number of samples, and this number of pairs scores each pose.
 _SAMPLES, _JUDGES = 128, 32
-# The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, "The
-# unreasonable effectiveness of quasirandom sequences", 2018).
+# The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, 2018).
 _ROOT = 1.2207440846057596
 
 
@@ -50,8 +48,7 @@ def propose(
         init: the initialiser; ``None``: the refinement starts from the given pose.
         problem: the problem.
         given: the caller's pose in the frame of the problem. This pose competes with the initialiser's poses.
-        views: number of views, see :func:`~kornia_pnpnet.propose.views.from_views`. For rigs, and for initialisers that
-            accept a given pose, this argument has no effect.
+        views: number of views. For rigs, and for initialisers that accept a given pose, this argument has no effect.
         order: see :func:`~kornia_pnpnet.propose.views.from_views`.
         fixed: whether the number of samples for a rig is fixed, as compiled and exported graphs require.
         search_follows: see :meth:`~kornia_pnpnet.propose.set.SetInit.forward`.
@@ -71,7 +68,6 @@ def propose(
         starts = starts.with_others(given)._replace(ok=None)
     if trait(init, "weighs_unusual"):
         return starts
-    # A pair that is not of normal scale keeps its weight only if some pose projects the point close to the pixel.
     known, limit = problem.map(torch.Tensor.detach), (_SEEN * problem.focal) ** 2
     seen = torch.zeros_like(problem.weights, dtype=torch.bool)
     for pose in map_tensors(torch.Tensor.detach, starts.poses):

@@ -1,4 +1,4 @@
-r"""Find the range of an unknown focal length, and a first estimate of focal length and pose."""
+"""Find the range of an unknown focal length, and a first estimate of focal length and pose."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from kornia_pnpnet.cameras import focal_length, pinholes, with_undistorted
 from kornia_pnpnet.core.performance import ranked
-from kornia_pnpnet.core.trees import map_tensors, put, take
+from kornia_pnpnet.core.trees import put, take
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
@@ -30,26 +30,23 @@ _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
 _HALF_WIDTH = math.sqrt(2.0)
 # If the caller expects a focal length, the search covers this number of standard deviations of log f on either side.
 _SEARCHED = 2.0
-# Inlier threshold in pixels of the normalised camera. For a focal length in the middle of the range, the threshold is
-# 0.65 % of half the width of the image.
+# Inlier threshold in pixels of the normalised camera: 0.65 % of half the image width at the middle of the range.
 _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
-# For problems that the refinement did not solve. Further iterations of the refinement replace most of the final steps.
+# For problems that the refinement did not solve, and that further iterations of the refinement follow.
 _FURTHER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, min_samples=64, final_steps=1)
-
-# Lower bound of the kernel's scale in the first step of `_with_distortion`, in focal lengths. At a radius of 0.7 focal
-# lengths, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07. Each step multiplies the bound by the second number.
-_WIDE, _SHRINK = 0.07, 0.6
-# Number of these steps, and the least bound.
-_STEPS, _LEAST = 14, 1e-5
+# Number of steps of `_with_distortion`. A lower bound of the kernel's scale (in focal lengths): its first value (at a
+# radius of 0.7, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07), its factor from step to step, and its least value.
+_STEPS, _WIDE, _SHRINK, _LEAST = 14, 0.07, 0.6, 1e-5
 
 
-def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
+def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> Inputs:
     """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
 
     The range lies around the caller's focal length, if its log has the standard deviation ``sigma``. Otherwise it is
     proportional to the size of the image: twice the principal point or, if larger, the extent of the pixels. Aspect
-    ratio and signs of fx and fy are kept. Matrices that are no pinhole cameras become NaN.
+    ratio and signs of fx and fy are kept. Matrices that are no pinhole cameras become NaN. ``radial`` is the number of
+    coefficients of radial distortion to estimate.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = focal_length(camera)  # (B,)
@@ -64,7 +61,7 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None) -> Inputs:
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
         nominal = expected = math.sqrt(_SHORTEST * _LONGEST) * half
-        width, precision = _WIDTH, None
+        width, precision = _WIDTH, 0.0 if radial else None  # the prior of distortion needs a number
     else:
         nominal, expected = given.detach(), given
         width, precision = min(_SEARCHED * sigma, _WIDTH), sigma**-2
@@ -82,37 +79,28 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     """Estimate the focal lengths, and a pose for the problems without a given pose.
 
-    RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length.
-
-    Args:
-        inputs: the result of :func:`with_nominal_focal`.
-        radial: number of coefficients of radial distortion to estimate. The estimated distortion is removed from the
-            pixels.
+    RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length. The
+    ``inputs`` are the result of :func:`with_nominal_focal`. The estimated ``radial`` distortion is removed from the
+    pixels.
     """
-    assert inputs.free_focal is not None
-    normalize = Normalize(order=False)
+    normalize, known = Normalize(order=False), inputs.free_focal
+    assert known is not None
     with torch.no_grad():
         problem, frame = normalize(*inputs[:5], confidence=inputs.confidence)
         one = torch.ones_like(problem.img_scale)
-        found = _FINDER(problem._replace(img_scale=one, free_focal=inputs.free_focal.scaled(frame.img_scale)))
-        assert found.camera is not None
+        found = _FINDER(problem._replace(img_scale=one, free_focal=known.scaled(frame.img_scale)))
         zoom = torch.where(found.camera[:, 0].isfinite(), found.camera[:, 0], 0.0)
     pose = frame.undo(found.pose)
     inputs = _zoomed(inputs, zoom)
     if radial:
-        known = inputs.free_focal
-        assert known is not None
-        if known.information is None:  # CameraTerm has the prior of distortion only if the information is a number
-            known = known._replace(information=torch.zeros_like(zoom))
-            inputs = inputs._replace(free_focal=known)
         with torch.no_grad():
             problem, frame = normalize(*inputs[:5])
-            problem = problem._replace(free_focal=known.scaled(frame.img_scale))
-            at = _with_distortion(problem, frame.apply(pose), radial)
+            # These steps use only the prior of distortion. The refinement also uses the prior of the focal length.
+            known = known._replace(information=torch.zeros_like(zoom)).scaled(frame.img_scale)
+            at = _with_distortion(problem._replace(free_focal=known), frame.apply(pose), radial)
             finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()
-            pose = map_tensors(
-                lambda x, y: torch.where(finite.view(-1, *(1,) * (x.ndim - 1)), x, y), frame.undo(at.pose), pose
-            )
+            rows = finite.nonzero()[:, 0]
+            pose = put(pose, rows, take(frame.undo(at.pose), rows))
             camera = torch.where(finite[:, None], at.camera, 0.0)
         inputs = _zoomed(inputs, camera[:, 0])
         inputs = with_undistorted(inputs, as_dist(camera[:, 1:]), None)._replace(radial=camera[:, 1:])
@@ -121,17 +109,15 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 @torch.no_grad()
 def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, Tensor]:
-    """Replace pose and focal length of problems that are ``doubted`` (B,) by those of a search.
+    """Replace pose and focal length of problems that are ``doubted`` (B,) by those of RANSAC.
 
-    RANSAC tries P3P at the focal lengths of a grid. Also returns in which problems the search found a pose, bool (B,).
+    Also returns in which problems RANSAC found a pose, bool (B,).
     """
     rows = doubted.nonzero()[:, 0]
     if not len(rows):
         return state, doubted
     some = take(problem, rows)
     found = _FURTHER(some._replace(img_scale=torch.ones_like(some.img_scale)))
-    assert found.ok is not None
-    assert found.camera is not None
     usable = found.ok & found.camera.isfinite().all(1)
     state = put(state, rows[usable], take(State(found.pose, found.camera), usable))
     return state, doubted.index_put((rows,), usable)
@@ -174,15 +160,12 @@ def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
     The scale of the kernel is proportional to the median residual. Its lower bound shrinks from step to step.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
-    # These steps use only the prior of distortion. The refinement also uses the prior of the focal length.
-    information = torch.zeros_like(problem.img_scale)
-    problem = problem._replace(free_focal=problem.free_focal._replace(information=information))
     limit = _WIDE
     for _ in range(_STEPS):
         projection = project(state, problem)
         seen, sq_residual = projection.in_front & (problem.weights > 0), projection.sq_residual
         sq_limit = (limit * projection.focal).square()[:, None]
-        sq_scale, _ = cauchy_scale(sq_residual, seen & (sq_residual <= CAUCHY**2 * sq_limit), MIN_PAIRS + 1)
+        sq_scale = cauchy_scale(sq_residual, seen & (sq_residual <= CAUCHY**2 * sq_limit), MIN_PAIRS + 1)
         sq_scale = sq_scale.nan_to_num(posinf=0.0).maximum(sq_limit)
         weights = torch.where(seen, 1.0 / (1.0 + sq_residual / sq_scale), 0.0)
         state = least_squares(problem, projection, weights, sq_scale / CAUCHY**2)

@@ -15,8 +15,7 @@ __all__ = ["Initialiser", "trait"]
 class Initialiser(Configured):
     """A module that maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
 
-    Any module with the same ``forward`` is an initialiser. If the module does not have an attribute of this class,
-    solvers use the default of this class.
+    Any module with the same ``forward`` is an initialiser. The defaults below replace attributes that it lacks.
 
     Attributes:
         pairs_at_once: largest number of pairs per thread in a part of a batch. On a CPU and without gradients, solvers
@@ -44,5 +43,5 @@ class Initialiser(Configured):
 
 
 def trait(init: nn.Module | None, name: str) -> Any:
-    """An attribute of an initialiser, or the default of :class:`Initialiser` if the module lacks the attribute."""
+    """An attribute of an initialiser, or its default."""
     return getattr(init, name, getattr(Initialiser, name))

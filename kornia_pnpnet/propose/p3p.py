@@ -13,8 +13,7 @@ of the rays, the conic is a pair of lines when
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3.
 
 One root of this cubic gives two lines. Each line intersects a conic with other weights in two points. A Newton step
-then refines the ratios. We add to the sources of :func:`p3p` the short form of the cubic, the choice of its root, and
-the equations of the lines in differences of distances.
+then refines the ratios.
 
 The last dimension of every tensor is a chunk of C problems. Finite values are selected by ``lerp`` with a weight of 0
 or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
@@ -30,9 +29,9 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, common_dtype
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.performance import compiling, exporting, fold_vmap, unfold_vmap
-from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.sampling import kept_at_once
+from kornia_pnpnet.propose.scoring import as_pose
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose
 
@@ -40,24 +39,22 @@ __all__ = ["P3P", "minimal_poses", "p3p"]
 
 # Bytes of a vector that has one number per problem of a chunk. A core's caches hold a few dozen of these vectors.
 _CHUNK_BYTES = 2**16
-# Power of the machine epsilon. A candidate is a solution if its triangle differs from the world triangle by less than
-# this power times the distance of the camera. (The longest edge is 1.)
-_ERROR_POWER = 2 / 3
-# Largest difference between the edges of a solution's triangle and of the world triangle, relative to the longest edge.
-_LARGEST_ERROR = 0.01
+# A candidate is a solution if its triangle differs from the world triangle, whose longest edge is 1, by less than
+# eps^_ERROR_POWER times the distance of the camera, and by less than _LARGEST_ERROR.
+_ERROR_POWER, _LARGEST_ERROR = 2 / 3, 0.01
+# Least distance of the camera from a point, in units of eps^_ERROR_POWER longest edges. At a smaller distance, rounding
+# would determine the ray of the point.
+_CLOSE = 64.0
 # A triangle counts as a line when its height, over its size and its distance from the origin, is below this number of
 # machine epsilons.
 _LINE = 32.0
-# Number of focal lengths in the grid of an unknown focal length.
-_FOCALS = 12
-# Approximate least distance of the camera from a point. The unit is the longest edge times the machine epsilon to the
-# power `_ERROR_POWER`. A closer camera is rejected, because rounding would determine the ray of the point.
-_CLOSE = 64.0
 # Newton steps for the root of the cubic. They reduce a relative error of 37 % to rounding in float64.
 _CUBIC_STEPS = 4
-# Power of the machine epsilon. A Newton step for the ratios is damped if its squared determinant is below this power
-# times the product of two squared edges: when two solutions nearly coincide, the full step would be noise.
+# A Newton step for the ratios is damped if its squared determinant is below this power of the machine epsilon times two
+# squared edges: when two solutions nearly coincide, the full step would be noise.
 _DAMPING_POWER = 1.25
+# Number of focal lengths in the grid of an unknown focal length.
+_FOCALS = 12
 
 
 def _greater(first: Tensor, second: Tensor) -> Tensor:
@@ -168,8 +165,12 @@ def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
     return torch.stack((torch.addcmul(dist3, slope, y).addcmul_(offset, dist3), y.add_(dist3), dist3))
 
 
-def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
-    """The candidates of :func:`_distances`, up to scale, before the Newton step."""
+def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
+    """Four candidates (3, 2, 2, C) for the distances of a triangle whose edge 1 is the longest and has the length 1.
+
+    ``p`` and ``q`` (C,) are the squared lengths of the edges 3 and 2, and ``r`` is ``1 - p - q`` without rounding. For
+    ``b`` (3, C) and ``g`` (C,) see the module. All candidates are finite, and the first distance is not negative.
+    """
     h = 0.5 * b
     s1, s2, s3 = torch.addcmul(b, h, h, value=-1.0)
     # u_1 = -(p u_3 + q u_2). The unknown of the cubic is u_3 : u_2, and s · u = t_3 u_3 + t_2 u_2.
@@ -183,7 +184,11 @@ def _candidates(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor
     v = torch.stack(((p * u2).addcmul_(q, u3, value=-1.0), u3, -u2))
     u, v, h = _turned(torch.stack((u, v, h), 1), turn).unbind(1)
     slope, offset = _lines(u, h, pairs)
-    return _turned(_meet(slope, offset, v, h), turn, -1)
+    dist = _refined(_turned(_meet(slope, offset, v, h), turn, -1), p, q, b)
+    dist1, dist2, dist3 = dist
+    edge = dist2 - dist3
+    sq_edge = edge.mul_(edge).addcmul_(b[0], dist2 * dist3)
+    return dist.mul_(_signed(sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_(), dist1))
 
 
 def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
@@ -208,19 +213,6 @@ def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
     step2 = (r2 * r33).addcmul_(r3, r23, value=-1.0)
     step3 = r2.mul_(r32).addcmul_(r3, r22, value=-1.0)
     return torch.stack((dist1, *(torch.stack((dist2, dist3)).addcmul_(torch.stack((step2, step3)), inv, value=-0.5))))
-
-
-def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
-    """Four candidates (3, 2, 2, C) for the distances of a triangle whose edge 1 is the longest and has the length 1.
-
-    ``p`` and ``q`` (C,) are the squared lengths of the edges 3 and 2, and ``r`` is ``1 - p - q`` without rounding. For
-    ``b`` (3, C) and ``g`` (C,) see the module. All candidates are finite, and the first distance is not negative.
-    """
-    dist = _refined(_candidates(p, q, r, b, g), p, q, b)
-    dist1, dist2, dist3 = dist
-    edge = dist2 - dist3
-    sq_edge = edge.mul_(edge).addcmul_(b[0], dist2 * dist3)
-    return dist.mul_(_signed(sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_(), dist1))
 
 
 def _dot(v: Tensor, w: Tensor) -> Tensor:
@@ -299,20 +291,20 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
 
 
 def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of rotations and translations (12, 4, B), and whether each pose is a solution (4, B)."""
+    """See :func:`minimal_poses`."""
     batch = world_points.shape[0]
     if compiling():
         rotation, translation, found = _solve_chunk(world_points, plane_points)
-        return torch.cat((rotation.flatten(0, 1), translation)).flatten(1, 2), found.flatten(0, 1)
-    out = world_points.new_empty(12, 2, 2, batch)
+        return torch.cat((rotation, translation[:, None]), 1).flatten(2, 3).flatten(0, 1), found.flatten(0, 1)
+    out = world_points.new_empty(3, 4, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
     chunk = kept_at_once(_CHUNK_BYTES, world_points) // world_points.element_size()
     with torch.inference_mode():  # faster than `no_grad` by an eighth
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)
             rotation, translation, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
-            torch.cat((rotation.flatten(0, 1), translation), out=out[..., part])
-    return out.flatten(1, 2), valid.flatten(0, 1)
+            torch.cat((rotation, translation[:, None]), 1, out=out[..., part])
+    return out.view(12, 4, batch), valid.view(4, batch)
 
 
 class _Solve(torch.autograd.Function):
@@ -334,8 +326,17 @@ class _Solve(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[int | None, int | None], *points: Tensor
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        components, valid = _Solve.apply(*fold_vmap(info.batch_size, in_dims, *points))  # type: ignore[no-untyped-call]
-        return (unfold_vmap(info.batch_size, components), unfold_vmap(info.batch_size, valid)), (2, 1)
+        entries, valid = _Solve.apply(*fold_vmap(info.batch_size, in_dims, *points))  # type: ignore[no-untyped-call]
+        return (unfold_vmap(info.batch_size, entries), unfold_vmap(info.batch_size, valid)), (2, 1)
+
+
+def minimal_poses(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype, whose fifth powers neither overflow nor underflow.
+
+    Returns the entries (12, 4, B) of :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which are valid, (4, B).
+    """
+    entries, valid = (_solve if compiling() else _Solve.apply)(world_points.detach(), plane_points.detach())
+    return entries, valid
 
 
 def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
@@ -344,12 +345,11 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     Use this function for problems of exactly three pairs. Most solvers reject the pose of three pairs, because
     no fourth pair confirms the pose (:attr:`~kornia_pnpnet.result.Status.NOT_BELIEVED`).
 
-    Convention: ``x_cam = R x_world + t``, the camera looks along +z.
-
-    The poses have no gradient. The batch is the last dimension in memory.
+    Convention: ``x_cam = R x_world + t``, the camera looks along +z. The poses have no gradient.
 
     Source: M. Persson and K. Nordberg, "Lambda Twist", ECCV 2018 (one degenerate conic); Y. Ding, J. Yang, V. Larsson,
-    C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023 (the cubic, lines from the adjugate matrix).
+    C. Olsson and K. Åström, "Revisiting the P3P Problem", CVPR 2023 (the cubic, lines from the adjugate matrix). The
+    short form of the cubic, the choice of its root, and the equations of the lines are ours.
 
     Args:
         world_points: points in any unit, shape :math:`(B, 3, 3)`. Any number of leading dimensions may replace
@@ -388,18 +388,9 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     world = world_points.detach().to(dtype)
     largest = world.abs().amax((-2, -1), keepdim=True).clamp(min=torch.finfo(dtype).tiny)
     unit = largest.log2().floor().exp2()  # a power of two, because rounding could separate double solutions
-    (rotation, translation), valid = minimal_poses(world / unit, plane_points.detach().to(dtype))
+    entries, valid = minimal_poses((world / unit).reshape(-1, 3, 3), plane_points.to(dtype).reshape(-1, 3, 2))
+    (rotation, translation), valid = as_pose(entries.permute(2, 1, 0).reshape(*size, 4, 12)), valid.mT.reshape(*size, 4)
     return Hypotheses(Pose(rotation, torch.where(valid[..., None], translation * unit, 0.0)), valid)
-
-
-def minimal_poses(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
-    """:func:`p3p` for points of one dtype, whose coordinates have fifth powers that neither overflow nor underflow."""
-    size = world_points.shape[:-2]
-    solve = _solve if compiling() else _Solve.apply
-    components, valid = solve(*(x.detach().reshape(-1, *x.shape[-2:]) for x in (world_points, plane_points)))
-    components = components.permute(2, 1, 0).reshape(*size, 4, 12)
-    pose = Pose(components[..., :9].unflatten(-1, (3, 3)), components[..., 9:])
-    return Hypotheses(pose, valid.mT.reshape(*size, 4))
 
 
 class P3P(Configured):
@@ -422,18 +413,14 @@ class P3P(Configured):
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
         """Four slots per sample, or per sample and focal length of the grid. See MinimalSolver.hypotheses."""
-        plane = problem.img_points / problem.focal
+        world, plane = problem.world_points, problem.img_points / problem.focal
         if problem.free_focal is None:
-            return minimal_poses(problem.world_points, plane)
-        at = (torch.arange(_FOCALS, dtype=plane.dtype, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
-        focal = (at[:, None] * problem.free_focal.width).exp()[..., None, None]  # (F, B, 1, 1)
-        world = problem.world_points.expand(_FOCALS, -1, -1, -1)
-        (rotation, translation), valid = minimal_poses(world, plane / focal)
-        one = torch.ones_like(focal)
-        rows = torch.cat((one, one, one / focal), -1)
-        pose = Pose(rotation * rows[..., None], translation * rows)
-        # From (F, B, 4, ...) to (B, 4 F, ...), with the batch last in memory.
-        return map_tensors(
-            lambda x: x.movedim((0, 1, 2), (-2, -1, -3)).flatten(-3, -2).movedim((-1, -2), (0, 1)),
-            Hypotheses(pose, valid),
-        )
+            entries, valid = minimal_poses(world, plane)
+        else:
+            at = (torch.arange(_FOCALS, dtype=plane.dtype, device=plane.device) + 0.5) * (2.0 / _FOCALS) - 1.0
+            focal = (at[:, None] * problem.free_focal.width).exp()  # (F, B)
+            seen = (plane / focal[..., None, None]).flatten(0, 1)
+            entries, valid = minimal_poses(world.expand(_FOCALS, -1, -1, -1).flatten(0, 1), seen)
+            entries, valid = entries.unflatten(2, focal.shape), valid.unflatten(1, focal.shape).flatten(0, 1)
+            entries = torch.cat((entries[:8], entries[8:] * focal.reciprocal())).flatten(1, 2)  # (12, 4 F, B)
+        return Hypotheses(as_pose(entries.permute(2, 1, 0)), valid.mT)

@@ -25,19 +25,18 @@ from torch import Tensor
 from kornia_pnpnet.core.performance import problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import Hypotheses, Problem
-from kornia_pnpnet.result import Pose
+from kornia_pnpnet.propose.scoring import as_pose
 
 __all__ = ["P3PRig"]
 
-# Number of distances at which a function is evaluated. Two solutions between neighbouring distances are missed. If
-# cameras look in all directions, 16 distances miss 4 % of the poses, and 32 distances miss 2 % (random exact samples).
+# Number of distances at which a function is evaluated. Two solutions between neighbouring distances are missed: 4 % of
+# the poses if cameras look in all directions.
 _DISTANCES = 16
 # Largest number of solutions, and number of Newton steps.
 _SOLUTIONS, _STEPS = 8, 6
-# A pose is a solution when the relative error of each side of the triangle is below this number.
-_EXACT = 1e-3
-# Largest difference of the product of the transposed and the rotation matrix from the identity.
-_ORTHOGONAL = 0.01
+# A pose is a solution when the relative error of each side of the triangle, and the difference of the product of the
+# transposed and the rotation matrix from the identity, are below these numbers.
+_EXACT, _ORTHOGONAL = 1e-3, 0.01
 
 
 class _Branches(NamedTuple):
@@ -99,15 +98,11 @@ class P3PRig:
         )
         ranges = torch.stack((start, *(x.at(start, sign) for x, sign in zip(branches, signs, strict=True))))
         rotation, translation, exact = _newton(world, rays, centres, sides, ranges)
-        eye = torch.eye(3, dtype=rays.dtype, device=rays.device)[..., None]
-        found = Hypotheses(
-            Pose(
-                eye.repeat(1, 1, _SOLUTIONS * batch).index_copy(-1, slots, torch.where(exact, rotation, eye)),
-                rays.new_zeros(3, _SOLUTIONS * batch).index_copy(-1, slots, torch.where(exact, translation, 0.0)),
-            ),
-            exact.new_zeros(_SOLUTIONS * batch).index_copy(0, slots, exact),
-        )
-        return map_tensors(lambda x: x.unflatten(-1, (_SOLUTIONS, batch)).movedim((-1, -2), (0, 1)), found)
+        identity = torch.eye(3, 4, dtype=rays.dtype, device=rays.device)[..., None]
+        found = torch.where(exact, torch.cat((rotation, translation[:, None]), 1), identity)
+        entries = identity.repeat(1, 1, _SOLUTIONS * batch).index_copy(-1, slots, found).flatten(0, 1)
+        valid = exact.new_zeros(_SOLUTIONS * batch).index_copy(0, slots, exact).view(_SOLUTIONS, batch)
+        return Hypotheses(as_pose(entries.unflatten(-1, valid.shape).permute(2, 1, 0)), valid.mT)
 
 
 def _starts(

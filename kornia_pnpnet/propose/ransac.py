@@ -1,4 +1,4 @@
-r"""RANSAC: the pose with the best score among the poses of many small samples, for batches."""
+"""RANSAC: the pose with the best score among the poses of many small samples, for batches."""
 
 from __future__ import annotations
 
@@ -25,15 +25,13 @@ __all__ = ["RANSAC", "search_on"]
 
 # A pose can fit this number of inliers closely even if their pixels are noisy.
 _FITTED = 5
-# Largest residuals of an inlier in :func:`search_on`, in standard deviations. The first limit is for the noise that a
-# network estimates, which is too small when most pairs are outliers. The second limit is for the caller's noise. On
-# problems of uncertain PnP (`benchmarks/uncertainty.py`, seeds 777 and 778, 10 pairs with 5 outliers), limits of 4 and
-# 8 lead to larger errors.
+# Largest residuals of an inlier in `search_on`, in standard deviations. The first limit is for the noise that a network
+# estimates, which is too small when most pairs are outliers. The second limit is for the caller's noise.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
-# Inlier threshold of `_on_grid`, divided by two factors: the median distance of the pixels from the principal point,
-# and half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
+# Least inlier threshold for an unknown focal length, divided by the median distance of the pixels from the principal
+# point and by half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# Lower bound of the depth at which :func:`search_on` converts noise of points to pixels, in normalised units.
+# Lower bound of the depth at which `search_on` converts noise of points to pixels, in normalised units.
 _NEAREST = 0.5
 # Chance that a pair of weight 0 is drawn, relative to a pair of weight 1. The second number is the same ratio for
 # confidences 0 and 1. The first number is larger, because networks mislead more often than callers.
@@ -46,16 +44,13 @@ class RANSAC(Initialiser):
     The samples of all problems are solved as one batch, in rounds. After each round the best pose of a problem is
     improved by least squares on its inliers (LO-RANSAC). A problem is done when a sample without an outlier has been
     drawn with the probability ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
-    drawn twice. The random numbers are the same for every problem and in every call. The result of a problem therefore
-    does not depend on the batch, up to rounding. Pairs of a large confidence are drawn more often than other pairs.
+    drawn twice. The random numbers are the same for every problem and call, so that the result of a problem does not
+    depend on the batch, up to rounding. Pairs of a large confidence are drawn more often than other pairs.
 
-    A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The ``threshold`` :math:`\tau` covers errors
-    of the pixels. The ``world_threshold`` :math:`\omega` covers errors of the points, which move the projection by
-    :math:`f/z` times the error. In least squares, the weight of an inlier is the inverse of the right-hand side. The
-    final steps multiply this weight by the weight of a Cauchy kernel.
-
-    Gradients: the final least-squares steps have gradients with respect to points, pixels and weights. These steps
-    start from a constant pose close to the minimum. The inliers, and their weights by depth, are constants.
+    A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
+    least squares, the weight of an inlier is the inverse of the right-hand side. The final steps multiply this weight
+    by the weight of a Cauchy kernel. They start from a constant pose close to the minimum, and have gradients with
+    respect to points, pixels and weights. The inliers, and their weights by depth, are constants.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
@@ -67,14 +62,12 @@ class RANSAC(Initialiser):
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
         scorer: ``"msac"`` (truncated squares), ``"inliers"`` (number of outliers), or a function (see
-            ``kornia_pnpnet.propose.scoring.Scorer``). The loss of a pose is the weighted sum of the losses of the
-            pairs.
+            ``kornia_pnpnet.propose.scoring.Scorer``) that gives the loss of a pair.
         max_samples: largest number of samples of a problem.
-        min_samples: smallest number of samples of a problem. One sample without an outlier may not suffice, because
-            noise can make its pose inaccurate.
+        min_samples: smallest number of samples of a problem. Noise can make the pose of a single sample inaccurate.
         confidence: required probability that at least one sample has no outlier, in (0, 1).
-        final_steps: number of least-squares steps from the best pose. These steps carry the gradient. With 0 steps the
-            pose has no gradient, which is sufficient before a refinement.
+        final_steps: number of least-squares steps from the best pose. With 0 steps the pose has no gradient, which is
+            sufficient before a refinement.
         seed: seed of the random numbers.
 
     Raises:
@@ -133,7 +126,7 @@ class RANSAC(Initialiser):
 
         Args:
             problem: normalised problems of a centred world, because the search computes in float32.
-            given: one pose per problem, in the frame of the problem. This pose competes with the poses of the samples.
+            given: one pose per problem, which competes with the poses of the samples.
 
         Returns:
             The poses, ``ok``, and weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for outliers.
@@ -156,15 +149,16 @@ class RANSAC(Initialiser):
             )
         # If tensors are contiguous, the rounding of sums over pairs does not depend on the position in the batch.
         problem = problem._replace(noise=None).map(torch.Tensor.contiguous)
-        # Weights are divided by the largest weight of the problem, so that their unit has no effect.
         problem = problem._replace(weights=relative(problem.weights, problem.weights))
         fixed = problem.map(torch.Tensor.detach)
         img, world = self.threshold * fixed.img_scale, self.world_threshold * fixed.world_scale
         thresholds = Thresholds(img[:, None], world[:, None])
         stages = [thresholds]
         with torch.no_grad():
-            if fixed.free_focal is not None:
-                stages = [thresholds._replace(img=thresholds.img.maximum(_on_grid(fixed))), thresholds]
+            if fixed.free_focal is not None:  # a wider threshold for focal lengths between two values of P3P's grid
+                away = torch.where(fixed.weights > 0, fixed.img_points.abs().amax(-1), torch.nan)
+                wide = _GRID_RESIDUAL * fixed.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0)
+                stages = [thresholds._replace(img=thresholds.img.maximum(wide[:, None])), thresholds]
             search = Search(self, fixed, stages[0], _trusted(fixed))
             search.run(map_tensors(lambda x: x.detach()[:, None], given))
         projection, judged = self._refined(problems_last(problem), search.state, stages)
@@ -184,18 +178,13 @@ class RANSAC(Initialiser):
         return projection, map_tensors(torch.Tensor.detach, judged)
 
 
-def _on_grid(problem: Problem) -> Tensor:
-    """Inlier threshold (B, 1) in pixels of the problem, for focal lengths between two values of P3P's grid."""
-    away = torch.where(problem.weights > 0, problem.img_points.abs().amax(-1), torch.nan)
-    return (_GRID_RESIDUAL * problem.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0))[:, None]
-
-
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
     """Weights (B, N) of a Cauchy kernel by the inliers' median residual, because thresholds are wide."""
-    sq_scale, count = cauchy_scale(errors, inliers > 0)
+    there = inliers > 0
+    sq_scale = cauchy_scale(errors, there).clamp(min=torch.finfo(errors.dtype).eps)
     # With few inliers, the median residual underestimates the noise. All weights are then closer to 1.
-    free = (count - _FITTED).clamp(min=0) / count.clamp(min=1)
-    return 1.0 / (1.0 + free * errors / sq_scale.clamp(min=torch.finfo(errors.dtype).eps))
+    count = there.sum(-1, keepdim=True, dtype=errors.dtype)
+    return 1.0 / (1.0 + (count - _FITTED).clamp(min=0) / count.clamp(min=1) * errors / sq_scale)
 
 
 _FURTHER = RANSAC(P3P(), min_samples=64)
@@ -213,9 +202,8 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
     A problem is searched only when it needs more than 64 samples for a confidence of 0.999, by the inliers of the best
-    pose of the starts. (Least squares on its inliers may improve the pose first.) If a pair has the weight :math:`w` in
-    the starts, its chance to be drawn is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller
-    increases the chance.
+    pose of the starts (improved by least squares). The weight :math:`w` of a pair in the starts makes its chance to be
+    drawn proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
     A pair is an inlier if its residual is below ten standard deviations, or five if the caller gave the noise of the
     pair. If the caller gave no noise, all pairs have the mean of the estimated standard deviations. Noise of points is
@@ -225,21 +213,21 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     Args:
         problem: normalised problems of a centred and scaled world.
         starts: several poses per problem, and the noise of the pairs. Weights are probabilities that pairs are inliers.
-        keep_others: whether the result keeps the other poses of the starts. The solver keeps these poses if the caller
-            gave a pose or a prior, because a search on few pairs can lead away from the correct pose.
+        keep_others: whether the result keeps the other poses of the starts, because a search on few pairs can lead away
+            from the correct pose.
 
     Returns:
-        First, the starts with the best pose, without gradient. The weights of a searched problem are those of a Cauchy
-        kernel at the best pose, with the inlier threshold as its scale, because the network's weights misled the first
-        pose. Second, the best pose by a quarter of the thresholds, a rival of the refined pose.
+        First, the starts with the best pose, without gradient. A searched problem has the weights of a Cauchy kernel at
+        the best pose, with the inlier threshold as its scale. Second, the best pose by a quarter of the thresholds, a
+        rival of the refined pose.
 
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.
     """
-    if starts.noise is None or starts.others is None:
-        raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')
     constant = map_tensors(torch.Tensor.detach, starts)
-    known, noise = problem.noise, map_tensors(torch.Tensor.detach, starts.noise)
+    known, noise = problem.noise, constant.noise
+    if noise is None or starts.others is None:
+        raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')
     problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
     depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)

@@ -3,7 +3,7 @@ r"""EPPnP and REPPnP: a pose from the null space of the projection equations. RE
 A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residuals are the algebraic
 errors. Unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). In an array
 ``rows`` (B, K + 1, 2 N), the first K rows are the derivatives of the errors by K unknowns, and the last row is the
-errors. The first N columns are the errors in u, and the last N columns are the errors in v.
+errors, first in u and then in v.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["REPPnP"]
 
+# Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
+_NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
 # Outlier rejection keeps at least this number of pairs: the 6 pairs of a null vector, or the 3 pairs of a rigid motion,
 # and one or two further pairs.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
 # A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4
-# Ridges on the depths of the control vectors during and after outlier rejection. On the protocol's problems, all values
-# from 1e-3 to 3e-2 give the same success. In the end, a large ridge would suppress the small depths of a narrow view.
+# Ridges on the depths of the control vectors during and after outlier rejection. In the end, a large ridge would
+# suppress the small depths of a narrow view.
 _DEPTH_PRIOR, _FINAL_DEPTH_PRIOR = 5e-3, 1e-5
-# Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
-_NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
 # This number is added to 1 minus the leverage of a pair, because the leverage can be 1.
 _LEVERAGE_RIDGE = 1e-6
 
@@ -46,16 +46,14 @@ class REPPnP(Initialiser):
     last null vector is aligned with the world by orthogonal Procrustes. Without rejection the method is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
-    Rejection", CVPR 2014. Our changes improve success on the protocol's problems or allow batches:
+    Rejection", CVPR 2014. Our changes improve success or allow batches:
 
-    - We scale the null vector so that the centroid has depth 1. The paper scales the null vector to length 1. Our null
-      vector solves a linear system, and does not depend on the control points, the frame or the unit. A small ridge
-      pulls all points toward the depth of the centroid. The ridge reduces the effect of outliers.
-    - Outliers are rejected by their leave-one-out error. Our quantile is 50 %, and the paper's quantile is 25 %. At
-      least 7 pairs are kept.
-    - A second loop rejects outliers with a rigid motion. Each iteration takes one Gauss-Newton step on the algebraic
-      error, and keeps at least 5 pairs. The final pose minimises the algebraic error of the kept pairs. The paper
-      alternates between a combination of four null vectors and a rigid motion.
+    - The null vector is scaled so that the centroid has depth 1 (paper: length 1). It solves a linear system, and does
+      not depend on the control points, the frame or the unit. A small ridge pulls all points toward the depth of the
+      centroid, which reduces the effect of outliers.
+    - Outliers are rejected by their leave-one-out error. The quantile is 50 % (paper: 25 %).
+    - A second loop rejects outliers with a rigid motion, by Gauss-Newton steps on the algebraic error. The final pose
+      minimises this error. The paper alternates between a combination of four null vectors and a rigid motion.
     - Both loops have a fixed length. The paper's loop stops when the quantile no longer decreases.
 
     The selection of pairs has no gradient. The last Gauss-Newton steps start from a detached pose, and their gradient
@@ -191,7 +189,7 @@ def _normal_matrix(rows: Tensor, weights: Tensor) -> Tensor:
 
 
 def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
-    """Inverse of the normal matrix plus a ridge. A tiny ridge is always added, so that the inverse exists."""
+    """Inverse of the normal matrix plus a ridge and a tiny number, so that the inverse exists."""
     ridge = torch.diag_embed(normal.new_zeros(normal.shape[1]) + ridge + 32.0 * torch.finfo(normal.dtype).eps)
     return torch.linalg.inv_ex(normal[..., :-1] + ridge).inverse
 

@@ -16,7 +16,7 @@ from kornia_pnpnet.core.performance import present_first
 __all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed", "spread_evenly"]
 
 # Number of nearest neighbours of a pair that are compared. They are searched among at most the second number of pairs,
-# so that the cost is linear in the number of pairs. The second number must be a power of two.
+# a power of two, so that the cost is linear in the number of pairs.
 _NEIGHBOURS, _CANDIDATES = 16, 512
 # The bits of an infinite float32.
 _INFINITE = 0x7F800000
@@ -35,8 +35,8 @@ def kept_at_once(count: int, like: Tensor) -> int:
 def spread_evenly(present: Tensor, count: int) -> Tensor:
     """Positions (B, count) of present pairs, evenly spread. If these pairs are too few, absent pairs are added.
 
-    Multiples of the golden ratio shift the positions, because the selection could follow a periodic pattern in the
-    order of the pairs. The shifts are small: no position occurs twice, unless fewer than ``count`` pairs exist.
+    Multiples of the golden ratio shift the positions slightly, because the selection could follow a periodic pattern in
+    the order of the pairs. No position occurs twice, unless fewer than ``count`` pairs exist.
     """
     steps = torch.arange(count, dtype=torch.float64, device=present.device)
     total = present.sum(1, keepdim=True).clamp(min=count)
@@ -119,11 +119,6 @@ class Samples:
     Attributes:
         counts: number of pairs that have a positive chance, (B,).
         totals: number of samples of each problem, (B,).
-
-    Example:
-        >>> samples = Samples(torch.ones(1, 4), size=3, most=10, seed=0)
-        >>> samples.totals.tolist(), sorted(samples.positions(torch.tensor([0]), 0, 4)[0].tolist())
-        ([4], [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
     """
 
     def __init__(self, chances: Tensor, *, size: int, most: int, seed: int) -> None:
@@ -154,8 +149,7 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        With unequal chances, the inverse of the inliers' mean chance (weighted by the chances) replaces the number of
-        pairs.
+        The inverse of the inliers' mean chance, weighted by the chances, replaces the number of pairs.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
@@ -163,10 +157,7 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Positions (P, count) of pairs in proportion to their chances, spread over the image.
-
-        (:class:`~kornia_pnpnet.frame.Normalize` orders pairs by their pixels.)
-        """
+        """Positions (P, count) of pairs in proportion to their chances, evenly spread over the order of the pairs."""
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
         return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
@@ -195,10 +186,6 @@ def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float
     The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
     without an outlier for :math:`k` inliers of :math:`c` pairs, not necessarily integers (M. Fischler and R. Bolles,
     "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B).
-
-    Example:
-        >>> samples_needed(torch.tensor([9, 6, 2]), torch.tensor([9, 9, 9]), 3, 0.999)
-        tensor([ 0.0000, 25.4023,     inf], dtype=torch.float64)
     """
     drawn = torch.arange(size, dtype=torch.float64, device=inliers.device)
     shares = (inliers[:, None] - drawn).clamp(min=0.0) / (counts[:, None] - drawn).clamp(min=1.0)

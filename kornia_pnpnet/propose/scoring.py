@@ -29,7 +29,7 @@ __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 #: Maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
-# The squared distance of a point behind the camera is increased by this number times the distance, beyond MAX_ERROR.
+# The squared distance of a point behind the camera is increased by this number times the depth, beyond MAX_ERROR.
 _BEHIND = 1e15
 
 

@@ -29,9 +29,12 @@ CAUCHY = 3.4
 
 # Poses are compared and improved in this dtype. At a focal length of 3400 px, rounding errors are about 1e-4 px.
 _DTYPE = torch.float32
-# On a CPU, at most the first number of samples is solved and scored at once, so that the tensors fit into a core's
-# caches. A round has at most the second number of samples.
-_SAMPLES_AT_ONCE, _LARGEST_ROUND = 8192, 4096
+# On a CPU, at most this number of samples is solved and scored at once, so that the tensors fit into a core's caches.
+_SAMPLES_AT_ONCE = 8192
+# Number of samples in a round, divided by the number of samples before the round, and its largest number.
+_GROWTH, _LARGEST_ROUND = 0.5, 4096
+# One round draws all remaining samples if they would take at most this number of rounds, or if they are few.
+_ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
 # After k samples, the first scoring of a round uses the maximum of the first number and the second number * k^(1/3)
 # pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then
 # 3 / w pairs contain at least one inlier with a probability of 95 %.
@@ -43,16 +46,11 @@ _KEPT_ONE_IN, _MORE = 2, 4
 _FEW_RESIDUALS = 4096
 # In each round, this number of poses with the smallest losses is improved. The best of them is then improved again.
 _IMPROVED = 3
-# Number of samples in a round, divided by the number of samples before the round.
-_GROWTH = 0.5
-# One round draws all remaining samples if they would take at most this number of rounds, or if they are few. With 9
-# pairs, 84 samples in one round take as long as two rounds. (An unknown focal length multiplies the time of a sample.)
-_ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
 # Squared ratio of the thresholds to the narrower thresholds of a rival.
 _NARROWER = 16.0
-# Relative damping of a least-squares step. Almost no damping is needed, because the start is close to the minimum.
+# Relative damping of a least-squares step, small because the start is close to the minimum.
 _DAMPING = 1e-6
 # Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
 # the pose of a minimal sample than at an improved pose.
@@ -60,15 +58,14 @@ _LIMITS = 3.0, 1.0
 # If `pose_sigma` exceeds the first number, at least the second number of samples is drawn. An incorrect pose may then
 # have as many inliers as the correct pose, for example in a flat scene and a narrow field of view.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
-# After this number of samples, pairs with a large `agreement_of_neighbours` are drawn more often. Computing the
-# agreement takes about as long as solving this number of samples.
+# After this number of samples, which take as long as `agreement_of_neighbours`, the chance that a pair is drawn is
+# multiplied by (a + agreement)^b. The numbers a and b were chosen empirically.
 _PLAIN_SAMPLES = 256
-# The chance that a pair is drawn is multiplied by (a + agreement)^b. These numbers a and b were chosen empirically.
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
 
 class Plan(Protocol):
-    """Options of a search. The arguments of :class:`~kornia_pnpnet.propose.ransac.RANSAC` describe them."""
+    """Options of a search, see :class:`~kornia_pnpnet.propose.ransac.RANSAC`."""
 
     minimal: MinimalSolver
     score: Scorer
@@ -98,17 +95,6 @@ class Search:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
         rivals: the best pose of each problem by a quarter of the thresholds, not improved, shape :math:`(B, 12)`.
-
-    Example:
-        >>> from kornia_pnpnet.propose.p3p import P3P
-        >>> from kornia_pnpnet.propose.ransac import RANSAC
-        >>> points = torch.rand(1, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> cam_points = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
-        >>> problem = Problem.of(points, 100.0 * cam_points[..., :2] / cam_points[..., 2:], 100.0)
-        >>> search = Search(RANSAC(P3P()), problem, Thresholds(points.new_ones(1, 1), points.new_zeros(1, 1)))
-        >>> drawn = search.run()
-        >>> round(search.state.pose.translation[0, 2].item(), 3)
-        5.0
     """
 
     def __init__(
@@ -140,7 +126,7 @@ class Search:
 
     @property
     def state(self) -> State:
-        """The best poses and cameras in the dtype of the problem. Rotations are orthogonal up to rounding."""
+        """The best poses and cameras in the dtype of the problem."""
         pose, camera = self._state(self.poses.to(self.problem.weights))
         # One Newton step towards the closest orthogonal matrix doubles the number of correct digits.
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
@@ -150,10 +136,9 @@ class Search:
         """Search each problem until its samples suffice for the plan's confidence, or until all samples are drawn.
 
         Args:
-            given: :math:`S` poses per problem, in the frame of the problem. These poses compete with the poses of the
-                samples. Shapes :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
-            enough: a problem with given poses is searched only if it needs more than this number of samples. The
-                inliers of its best pose determine how many samples it needs.
+            given: poses that compete with the poses of the samples, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
+            enough: a problem with given poses is searched only if it needs more than this number of samples, by the
+                inliers of its best pose.
 
         Returns:
             The positions of the problems of which samples were drawn.
@@ -359,10 +344,10 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
     return moved(projection.state, delta / -projection.focal)
 
 
-def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> tuple[Tensor, Tensor]:
-    """Squared scale (B, 1) of a Cauchy kernel, and number (B, 1) of pairs, for the arguments of `median_residual`."""
+def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
+    """Squared scale (B, 1) of a Cauchy kernel. The arguments are those of `median_residual`."""
     median = median_residual(sq_residuals, there, fitted)  # median / (2 log 2) is the variance of a coordinate
-    return CAUCHY**2 / (2.0 * math.log(2.0)) * median, there.sum(-1, keepdim=True, dtype=median.dtype)
+    return CAUCHY**2 / (2.0 * math.log(2.0)) * median
 
 
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import TypeVar
 
@@ -11,14 +12,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_pnpnet.core.checks import check_devices, check_whole
-from kornia_pnpnet.core.linalg import align
+from kornia_pnpnet.core.linalg import align, solve_symmetric
 from kornia_pnpnet.core.performance import are_few, compiling, present_first, problems_last, sees_values, take_pairs
 from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.judge.evidence import copies
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.sampling import spread_evenly
-from kornia_pnpnet.propose.view import LEAST_NOISE, LOG_NOISE, View, repeats
+from kornia_pnpnet.propose.scoring import as_entries, as_pose
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO, project
 from kornia_pnpnet.result import Pose
 
@@ -26,9 +28,18 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Number of features of a pair: 3 coordinates of the point, 2 of the pixel, 2 residuals, 3 features of the problem, 2
-# logarithms of noise and 2 flags. Confidences and repeats add 2 features each, see `View`.
+# Number of features of a pair, without confidences and repeats, see `_View`.
 _FEATURES = 14
+# Ridge of the affine camera, relative to the mean square of the world points, so that it is unique for planar points.
+_RIDGE = 0.02
+# Features are clipped to this absolute value, so that no pair dominates the network.
+_MOST = 8.0
+# Least confidence, and least distance of a confidence from 1.
+_LEAST_CONFIDENCE = 1e-3
+# Logarithm of the noise at the centre of its range. The unit of noise is the spread of the pixels or world points.
+_LOG_NOISE = -5.0
+# Least noise, as a share of the spread. Scores divide by the variance, which must not be 0.
+_LEAST_NOISE = 1e-6
 # The softmax is computed over rows of at least this number of pairs. PyTorch 2.13 is slow for shorter rows.
 _SHORT = 16
 # This number is added to the attention score of padding.
@@ -42,29 +53,115 @@ _SPREADS = ((18, 3), (24, 4), (30, 5))
 # Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two of them share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
-# The 32 likeliest pairs score each hypothesis.
-_MOST_JUDGES = 32
+# This number of the likeliest pairs scores each hypothesis. A squared residual of the second number of variances halves
+# the score of a pair. The third number is the score of a pair of likelihood 0, relative to a pair of likelihood 1.
+_MOST_JUDGES, _JUDGED, _LEAST_VOTE = 32, 50.0, 0.5
 # If the minimal samples have more slots than this number, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
-# A squared residual of this number of variances halves the score of a pair.
-_JUDGED = 50.0
-# The noise of points is converted to pixels at the depth of the world's centre, or at this depth
-# (normalised units) if the centre is closer.
+# Normalised units. Least depth at which the noise of points is converted to pixels.
 _LEAST_DEPTH = 0.5
-# Score of a pair with the likelihood 0, relative to the score of a pair with the likelihood 1.
-_LEAST_VOTE = 0.5
-# Before a search the network sees at most 48 pairs; the search uses all pairs. On real matches (`raw/by_image.npz`, see
-# docs/results) and random problems of up to 1000 pairs, 32 to 96 pairs have the same success as all pairs.
+# Before a search the network sees at most this number of pairs; the search uses all pairs. On real matches and random
+# problems of up to 1000 pairs, 32 to 96 pairs have the same success as all pairs.
 _ENOUGH = 48
+
+
+class _View:
+    r"""The network's input.
+
+    The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll: the
+    camera is rotated to the mean of the rays, and zoomed so that their spread is 1. The world is rotated to the axes of
+    an affine camera, which ridge regression fits to the pairs.
+
+    Attributes:
+        there: 1 for pairs of normal scale with a weight above 0, and 0 for other pairs, shape :math:`(B, N)`.
+        rays: unit rays in the frame of the original camera, shape :math:`(B, N, 3)`.
+        log_spread: logarithm of the spread of the rays, shape :math:`(B, 1)`. The spread is the root mean square sine
+            of the angles between the rays and the mean ray.
+        unit: spread of the pixels, and spread of the world points, shape :math:`(B, 2)`.
+        height: third coordinates of the rotated world points, shape :math:`(B, N)`.
+        features: the network's input, shape :math:`(B, N, C)`.
+    """
+
+    def __init__(self, problem: Problem, confidence: bool, repeats: Tensor | None) -> None:
+        world = problem.world_points.contiguous()
+        eye = torch.eye(3, dtype=world.dtype, device=world.device)
+        self.there = (problem.usual_weights > 0).to(world.dtype)
+        share = (self.there / self.there.sum(1, keepdim=True).clamp(min=1.0))[..., None]  # (B, N, 1)
+        plane = functional.pad(problem.img_points / problem.focal, (0, 1), value=1.0)
+        self.rays = functional.normalize(plane, dim=-1)
+        mean = functional.normalize((share * self.rays).sum(1), dim=-1)
+        # Two reflections rotate the mean ray to the z axis: first to the negative z axis, then z is negated.
+        half = mean + eye[2]
+        mirror = 1.0 - 2.0 * eye[2]
+        turn = (half * mirror)[..., None] * (half / half[:, 2:])[:, None]
+        across = torch.bmm(self.rays, (eye * mirror - turn)[:, :2].mT)
+        spread = ((share * across.square()).sum((1, 2)) + 1e-12).sqrt()[:, None]
+        seen = across / spread[..., None]
+        seen = seen - (share * seen).sum(1, keepdim=True)
+
+        moment, cross = torch.bmm(world.mT, share * torch.cat((world, seen), -1)).split((3, 2), -1)
+        affine = solve_symmetric(moment + _RIDGE * eye, cross).mT  # (B, 2, 3)
+        squares = affine.square().sum(-1)  # (B, 2)
+        points = torch.bmm(world, _frame(affine, squares).mT)
+        residual = torch.baddbmm(seen, world, affine.mT, alpha=-1)
+        self.height = points[..., 2]
+        self.log_spread = spread.log()
+        self.unit = torch.cat((problem.focal * spread, torch.ones_like(spread)), -1)
+        of_problem = torch.cat((self.log_spread, 0.5 * (squares + 1e-3).log()), -1)
+        parts = [points, seen, residual, of_problem[:, None].expand(-1, world.shape[1], -1), self._noise(problem)]
+        if confidence:
+            given = torch.full_like(problem.weights, torch.nan) if problem.confidence is None else problem.confidence
+            believed = given.nan_to_num(0.5).clamp(_LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE)
+            parts.append(torch.stack((believed.logit(), (~given.isnan()).to(world.dtype)), -1))
+        if repeats is not None:
+            parts.append(repeats)
+        self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
+
+    def _noise(self, problem: Problem) -> Tensor:
+        """Logarithms of the noise of pixels and points over their spread, and whether the noise is known, (B, N, 4)."""
+        if problem.noise is None:
+            return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
+        sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
+        known = sigmas.isfinite()
+        # Unknown sigmas are NaN. They are replaced before the division, because `unit` would have the gradient NaN.
+        relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
+        logs = torch.where(known, relative.clamp(min=_LEAST_NOISE).log() - _LOG_NOISE, 0.0)
+        return torch.cat((logs, known.to(logs.dtype)), -1)
+
+
+@torch.no_grad()
+def _repeats(problem: Problem) -> Tensor:
+    """Logarithms (B, N, 2) of the number of pairs with the same pixel, and the number of pairs with the same point."""
+    there = problem.usual_weights > 0
+    return torch.stack([copies(x, there) for x in (problem.img_points, problem.world_points)], -1).log()
+
+
+def _frame(affine: Tensor, squares: Tensor) -> Tensor:
+    """The rotation (B, 3, 3) whose first two rows are closest to ``affine`` (B, 2, 3) with the lengths² ``squares``."""
+    p, q = affine.unbind(1)
+    product = (p * q).sum(-1, keepdim=True)  # (B, 1)
+    # The closest orthonormal rows are S^-1/2 times the rows, where S is the Gram matrix of the rows. S^-1/2 is
+    # proportional to the adjugate of S + sqrt(det S) I.
+    raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
+    first, second = raised.split(1, -1)  # the gradient of `prod` would wait for a GPU
+    root = (first * second - product.square()).clamp(min=1e-12).sqrt()
+    diagonal = raised.flip(-1) + root
+    u, v = (diagonal[..., None] * affine - product[..., None] * affine.flip(1)).unbind(1)
+    eye = torch.eye(3, dtype=u.dtype, device=u.device)
+    u = functional.normalize(u + 1e-6 * eye[0], dim=-1)
+    # A reflection maps the z axis to u or to -u. The same reflection maps the x axis to a vector orthogonal to u.
+    sign = torch.where(u[:, 2:] < 0, u.new_full((), -1.0), 1.0)
+    orthogonal = eye[0] - (u[:, :1] / (1.0 + sign * u[:, 2:])) * (u + sign * eye[2])
+    v = functional.normalize(v - (u * v).sum(-1, keepdim=True) * u + 1e-6 * orthogonal, dim=-1)
+    return torch.stack((u, v, torch.linalg.cross(u, v)), 1)
 
 
 def _taken(tree: _T, index: Tensor) -> _T:
     """Select the pairs at positions (B, K) in each tensor (B, N, ...) of pairs. Other tensors do not change."""
 
     def take(x: Tensor) -> Tensor:
-        if x.ndim < 2 or x.shape[1] <= index.shape[1]:
-            return x
-        return x.gather(1, index if x.ndim == 2 else index[..., None].expand(-1, -1, x.shape[2]))
+        of_pairs = x.ndim > 1 and x.shape[1] > index.shape[1]
+        return x.take_along_dim(index if x.ndim == 2 else index[..., None], 1) if of_pairs else x
 
     return map_tensors(take, tree)
 
@@ -84,32 +181,33 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
     return noise.img.square() + (focal * noise.world / depth).square()
 
 
-def _samples(count: int, number: int, search_follows: bool) -> list[tuple[int, tuple[int, int, int]]]:
-    """Minimal samples as ranks of three pairs, each after the least number of pairs of a problem that uses it."""
-    likeliest = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
-    if search_follows:  # the search draws further samples
-        return likeliest
-    spread = [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in likeliest]
-    ring = [(_RING_FROM, sample) for sample in _RING]
-    return [(least, sample) for least, sample in (*likeliest, *spread, *ring) if least <= count]
+def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
+    """Minimal samples: least numbers of pairs of a problem that uses a sample (S), and ranks of the pairs (3 S)."""
+    every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
+    if not search_follows:  # a search draws further samples
+        every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
+        every += [(_RING_FROM, sample) for sample in _RING]
+    least, samples = zip(*(x for x in every if x[0] <= count), strict=True)
+    return least, [rank for ranks in zip(*samples, strict=True) for rank in ranks]
 
 
 @cache
 def _sample_table(count: int, number: int, search_follows: bool, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Positions (3 S,) and least numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
+    """Ranks (3 S,) and least numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
 
     A CUDA graph cannot contain a copy from the CPU.
     """
-    least, samples = zip(*_samples(count, number, search_follows), strict=True)
+    least, ranks = _samples(count, number, search_follows)
     with torch.inference_mode(False):  # later calls may need gradients
-        return torch.tensor(samples, device=device).mT.flatten(), torch.tensor(least, device=device)[:, None]
+        return torch.tensor(ranks, device=device), torch.tensor(least, device=device)[:, None]
 
 
-def _support(rotation: Tensor, translation: Tensor, judges: Tensor) -> Tensor:
-    """Scores (H, B) of rotations (3, 3, H, B) and translations (3, H, B). The pairs ``judges`` (7, K, B) score."""
+def _support(poses: Tensor, judges: Tensor) -> Tensor:
+    """Scores (H, B) of poses [R | t] (3, 4, H, B) by the pairs ``judges`` (7, K, B)."""
     a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
-    points = torch.addcmul(translation[:, :, None], rotation[:, 0, :, None], a)  # (3, H, K, B)
-    x, y, z = points.addcmul_(rotation[:, 1, :, None], b).addcmul_(rotation[:, 2, :, None], c).unbind()
+    first, second, third, translation = poses[:, :, :, None].unbind(1)  # (3, H, 1, B) each
+    points = torch.addcmul(translation, first, a)  # (3, H, K, B)
+    x, y, z = points.addcmul_(second, b).addcmul_(third, c).unbind()
     across = torch.addcmul(x * x, y, y)
     front = (z * z.abs()).mul_(1.0 - MIN_DEPTH_RATIO**2) > MIN_DEPTH_RATIO**2 * across
     inverse = z.reciprocal()
@@ -140,8 +238,7 @@ class _Block(nn.Module):
         values, scores = self.look.weight.split((width, heads))
         # The scores have no bias, because the softmax over pairs cancels a bias.
         attention = _attention(y, scores, absent).movedim(0, 1)  # (B, heads, N)
-        # The values are linear in y, so that the mean of the values follows from the mean of y. One matrix product per
-        # problem and head replaces one per pair.
+        # The values are linear in y, so that the mean of the values follows from the mean of y.
         means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
         bias = self.look.bias[:width].view(heads, 1, -1)
         context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).reshape(batch, width)
@@ -169,16 +266,15 @@ class SetInit(Initialiser):
     point from the camera. The pose is the rigid motion that aligns the world points with the points at these distances.
     Poses are equivariant to similarity transforms of the world, and to rotations of the camera except the roll.
 
-    The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`). The 32
-    likeliest pairs score the poses of the samples. The best pose is a further hypothesis, and has no gradient.
+    The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`), and score the
+    poses of the samples. The best pose is a further hypothesis, and has no gradient.
 
     The weight of a pair is the estimated probability that the pair is an inlier. The network also estimates unknown
     noise. The layers compute in the dtype of the network's weights, all other operations in that of the pairs.
 
-    The design is ours. From the literature are distances along rays followed by alignment (J. Hesch and S. Roumeliotis,
-    "A direct least-squares method for PnP", ICCV 2011), attention pooled over correspondences (W. Sun et al., "ACNe:
-    Attentive context normalization for robust permutation-equivariant learning", CVPR 2020), and the samples (P.
-    Turán's problem for (6, 4, 3), 1941).
+    Sources: J. Hesch and S. Roumeliotis, "A direct least-squares method for PnP", ICCV 2011 (distances along rays, then
+    alignment); W. Sun et al., "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR
+    2020 (attention pooled over correspondences); P. Turán's problem for (6, 4, 3), 1941 (the samples).
 
     Args:
         width: number of channels of each pair.
@@ -244,8 +340,8 @@ class SetInit(Initialiser):
         Args:
             problem: pairs in any order. The world is centred and scaled.
             search_follows: whether :func:`~kornia_pnpnet.propose.ransac.search_on` follows. The network then sees at
-                most 48 pairs, and solves fewer samples. The weight of a pair that the network does not see is the
-                agreement of the pair with the last hypothesis.
+                most 48 pairs, and solves fewer samples. The agreement of each other pair with the last hypothesis is
+                its weight.
 
         Returns:
             The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
@@ -256,11 +352,11 @@ class SetInit(Initialiser):
         """
         check_devices({"world_points": problem.world_points}, self.pair.bias, "the network")
         given, index, starts = problem, None, self.starts
-        same = repeats(problem) if self.repeats else None
+        same = _repeats(problem) if self.repeats else None
         if search_follows and problem.weights.shape[1] > _ENOUGH:
             index = spread_evenly(problem.usual_weights > 0, _ENOUGH)
             problem, same = _taken((problem, same), index)
-        view = View(problem, self.confidence, same)
+        view = _View(problem, self.confidence, same)
         of_pairs, of_problem = (x.to(view.there.dtype) for x in self._run(view))
         probability = torch.sigmoid(of_pairs[0])
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
@@ -289,15 +385,13 @@ class SetInit(Initialiser):
         """The pose with the best score of all minimal samples, or ``fallback`` if no sample has a valid pose."""
         batch, count = chances.shape
         there = problem.usual_weights > 0
-        # Unlikely pairs also contribute to scores, because they can be inliers. Padding does not contribute.
+        # Unlikely pairs also contribute to scores, because they can be inliers.
         vote = torch.add((1.0 - _LEAST_VOTE) * chances, there, alpha=_LEAST_VOTE)
         # The variance is computed at the depth of the network's pose. At the depth of a hypothesis close to the points,
         # the variance would be large, and most pairs would agree with the hypothesis.
         precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, fallback))
-        plane_points = problem.img_points / problem.focal
-        of_pairs = torch.cat(
-            (problem.world_points, plane_points, vote[..., None], precision[..., None]), -1
-        )  # (B, N, 7)
+        plane_points, scoring = problem.img_points / problem.focal, (vote[..., None], precision[..., None])
+        of_pairs = torch.cat((problem.world_points, plane_points, *scoring), -1)  # (B, N, 7)
         if not isinstance(count, int):  # exported for any number of pairs: append padding
             more = of_pairs[:, :1] * torch.tensor((1, 1, 1, 1, 1, 0, 1), dtype=vote.dtype, device=vote.device)
             of_pairs = torch.cat((of_pairs, more.expand(-1, _MOST_JUDGES, -1)), 1)
@@ -305,39 +399,32 @@ class SetInit(Initialiser):
         likely = chances.topk(min(_MOST_JUDGES, count)).indices
         pairs = take_pairs(of_pairs, likely)  # (7, K, B)
         if compiling():  # compiled code is faster with `stack`
-            least, samples = zip(*_samples(count, self.samples, search_follows), strict=True)
+            least, ranks = _samples(count, self.samples, search_follows)
             enough = torch.tensor(least, device=there.device)[:, None]
-            three = torch.stack([pairs[:6, k] for column in zip(*samples, strict=True) for k in column], 1)
+            three = torch.stack([pairs[:6, rank] for rank in ranks], 1)
         else:
-            places, enough = _sample_table(count, self.samples, search_follows, pairs.device)
-            three = pairs[:6].index_select(1, places)
+            of_table, enough = _sample_table(count, self.samples, search_follows, pairs.device)
+            three = pairs[:6].index_select(1, of_table)
         three = three.unflatten(1, (3, -1)).flatten(2)  # (6, 3, S B)
-        pose, valid = minimal_poses(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))[:2]
-        # In memory, the result of p3p has the dimensions: components, solutions, samples, problems.
+        entries, valid = minimal_poses(three[:3].permute(2, 1, 0), three[3:5].permute(2, 1, 0))
         each = enough.shape[0], batch
-        rotation, translation = (x.movedim((0, 1), (-1, -2)).unflatten(-1, each).flatten(-3, -2) for x in pose)
-        rotation = rotation.flatten(0, 1)  # (9, H, B)
-        valid = (valid.mT & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
+        entries = entries.unflatten(-1, each).flatten(1, 2)  # (12, H, B)
+        valid = (valid & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
         if not search_follows and count >= _SPREADS[0][0]:  # padding does not count as pairs
             valid = valid & (there.sum(1) >= enough)
         valid = valid.flatten(0, 1)  # (H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
             slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT
-            rotation, translation = (x.gather(1, slots.expand(len(x), -1, -1)) for x in (rotation, translation))
-            valid = valid.gather(0, slots)
-        matrices = rotation.unflatten(0, (3, 3))
-        support = _support(matrices, translation, pairs)
+            entries, valid = entries.gather(1, slots.expand(12, -1, -1)), valid.gather(0, slots)
+        support = _support(entries.unflatten(0, (3, 4)), pairs)
         valid = valid & (support > 0)
         if problem.prior is not None:
-            poses = Pose(matrices.permute(2, 3, 0, 1), translation.permute(1, 2, 0))  # (H, B, ...)
-            support = support - problem.prior.disagreement(poses)
+            support = support - problem.prior.disagreement(as_pose(entries.permute(1, 2, 0)))
         score, best = torch.where(valid, support, -torch.inf).max(0)
-        every = torch.cat((rotation, translation)).gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
-        found = (score > -torch.inf)[:, None]
-        every = torch.where(found, every, torch.cat((fallback.rotation.flatten(1), fallback.translation), 1))
-        return Pose(every[:, :9].unflatten(1, (3, 3)), every[:, 9:])
+        chosen = entries.gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
+        return as_pose(torch.where((score > -torch.inf)[:, None], chosen, as_entries(fallback)))
 
-    def _run(self, view: View) -> tuple[Tensor, Tensor]:
+    def _run(self, view: _View) -> tuple[Tensor, Tensor]:
         """The outputs of the network for pairs (1 + 2 S, B, N), and for problems (B, S + 2)."""
         x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
         absent = torch.where(view.there > 0, x.new_zeros(()), _ABSENT).contiguous()
@@ -348,11 +435,11 @@ class SetInit(Initialiser):
         share = _attention(x, self.pair.weight[:1], absent)[0]  # the softmax cancels a bias
         return pair, self.problem(torch.bmm(share[:, None], x.view(*absent.shape, x.shape[-1]))[:, 0])
 
-    def _noise(self, problem: Problem, view: View, estimate: Tensor) -> Noise:
+    def _noise(self, problem: Problem, view: _View, estimate: Tensor) -> Noise:
         """The noise of each pair: the known noise of the problem, else the network's estimate."""
-        guessed = ((LOG_NOISE + 3.0 * estimate.tanh()).exp() * view.unit)[:, None].expand(*problem.weights.shape, 2)
+        guessed = ((_LOG_NOISE + 3.0 * estimate.tanh()).exp() * view.unit)[:, None].expand(*problem.weights.shape, 2)
         if problem.noise is not None:
             known = torch.stack((problem.noise.img, problem.noise.world), -1)
             guessed = torch.where(known.isfinite(), known, guessed)
-        img, world = guessed.maximum(LEAST_NOISE * view.unit[:, None]).unbind(-1)
+        img, world = guessed.maximum(_LEAST_NOISE * view.unit[:, None]).unbind(-1)
         return Noise(img, world)
