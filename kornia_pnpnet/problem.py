@@ -135,7 +135,10 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty of poses :math:`(B, …)` in the choice of the best start. Each outlier pair has the penalty 1."""
+        """Penalty of poses in the choice of the best start, of which the scale is the penalty 1 of an outlier pair.
+
+        The batch of the poses, for example :math:`(H, B)` or :math:`(P, H)`, broadcasts with the batch of the term.
+        """
 
 
 class Problem(NamedTuple):
@@ -154,7 +157,7 @@ class Problem(NamedTuple):
         confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`.
         rig: the transform from the rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose
             of the problem is then the pose of the rig. ``None``: one camera.
-        prior: prior of the pose, a :class:`~kornia_pnpnet.refine.terms.PoseTerm`.
+        pose_terms: priors of the pose, such as :class:`~kornia_pnpnet.refine.terms.PoseTerm`.
         free_focal: range and prior of an unknown focal length, a :class:`~kornia_pnpnet.refine.terms.CameraTerm`;
             ``None``: the focal length is ``focal``.
     """
@@ -169,7 +172,7 @@ class Problem(NamedTuple):
     noise: Noise | None = None
     confidence: Tensor | None = None
     rig: Pose | None = None
-    prior: Any = None
+    pose_terms: tuple[Term, ...] = ()
     free_focal: Any = None
 
     @classmethod
@@ -182,10 +185,14 @@ class Problem(NamedTuple):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The prior terms. An unknown focal length without information (no ``focal_sigma``) adds no term."""
-        free = self.free_focal is not None and self.free_focal.information is not None
-        known = self.prior, self.free_focal if free else None
-        return tuple(term for term in known if term is not None)
+        """The priors of the pose and of the camera."""
+        return self.pose_terms + self.camera_terms
+
+    @property
+    def camera_terms(self) -> tuple[Term, ...]:
+        """The prior of the camera. An unknown focal length without ``focal_sigma`` has no prior."""
+        known = self.free_focal is not None and self.free_focal.information is not None
+        return (self.free_focal,) if known else ()
 
     @property
     def usual_weights(self) -> Tensor:

@@ -369,8 +369,8 @@ class PnPNet(PretrainedMixin):
             world, img, weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in problem[:3])
             problem = problem._replace(world_points=world, img_points=img, weights=weights)
         if inputs.prior is not None:
-            prior, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
-            problem, init = problem._replace(prior=prior), inputs.prior.pose if init is None else init
+            term, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
+            problem, init = problem._replace(pose_terms=(term,)), inputs.prior.pose if init is None else init
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
         if inputs.free_focal is not None:
             problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))

@@ -20,8 +20,7 @@ from torch.nn import functional
 from kornia_pnpnet.core.performance import exporting
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.judge.inliers import MAX_ERROR, Thresholds
-from kornia_pnpnet.problem import Problem
-from kornia_pnpnet.refine.terms import PoseTerm
+from kornia_pnpnet.problem import Problem, Term
 from kornia_pnpnet.result import Pose
 
 __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
@@ -66,13 +65,13 @@ class Scene(NamedTuple):
             twelve coefficients for the entries of :func:`as_pose`, and a constant. Shape :math:`(P, 3, N, 13)`.
         weights: weights of the pairs, shape :math:`(P, 1, N)`.
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)` or :math:`(P, N, 1)`.
-        prior: prior of the poses; ``None``: no prior.
+        terms: priors of the poses.
     """
 
     rows: Tensor
     weights: Tensor
     sq_world: Tensor
-    prior: PoseTerm | None = None
+    terms: tuple[Term, ...] = ()
 
     @classmethod
     def of(cls, problem: Problem, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
@@ -91,7 +90,7 @@ class Scene(NamedTuple):
             torch.cat((products.flatten(-2), camera[..., 3:]), -1),
             problem.weights[:, None],
             thresholds.world.square()[..., None] + torch.finfo(dtype).tiny,  # avoids 0/0 at the camera centre
-            problem.prior,
+            problem.pose_terms,
         )
         return map_tensors(lambda x: x.to(dtype), scene)
 
@@ -101,16 +100,15 @@ class Scene(NamedTuple):
         return self._replace(rows=rows, weights=self.weights.gather(2, positions[:, None]))
 
     def losses(self, poses: Tensor, scorer: Scorer, narrower: float = 1.0) -> Tensor:
-        """Losses (P, H) of poses (P, 12, H): the weighted sum of the pairs' losses, plus the loss of the prior.
+        """Losses (P, H) of poses (P, 12, H): the weighted sum of the pairs' losses, plus the losses of the priors.
 
         Squared residuals are multiplied by ``narrower``.
         """
         errors = self.errors(poses)
         losses = (self.weights @ scorer(errors if narrower == 1.0 else errors.mul_(narrower)))[:, 0]
-        if self.prior is None:
-            return losses
-        prior = map_tensors(lambda x: x[:, None], self.prior)  # broadcasts over H poses
-        return losses + prior.disagreement(as_pose(poses.mT))
+        for term in map_tensors(lambda x: x[:, None], self.terms):  # broadcasts over H poses
+            losses = losses + term.disagreement(as_pose(poses.mT))
+        return losses
 
     def errors(self, poses: Tensor) -> Tensor:
         """Standardised squared residuals (P, N, H) of every pair at every pose (P, 12, H), at most MAX_ERROR.

@@ -331,12 +331,12 @@ class Search:
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
     """Take one least-squares step. Pairs are weighted by the products of ``weights`` (B, N) and ``problem.weights``.
 
-    If the camera has a prior, ``variance`` (B, 1) is the variance of a pixel coordinate, which determines the relative
-    weight of the prior. The default is one squared pixel of the caller's image.
+    If the focal length has a prior, ``variance`` (B, 1) is the variance of a pixel coordinate, which determines the
+    relative weight of the prior. The default is one squared pixel of the caller's image.
     """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
-    for term in problem._replace(prior=None).terms:
+    for term in problem.camera_terms:
         variance = problem.img_scale.square()[:, None] if variance is None else variance
         equations = equations._replace(unit=variance.reciprocal())
         equations = add_term(equations, term.linearise(projection.state), projection.focal)

@@ -418,8 +418,8 @@ class SetInit(Initialiser):
             entries, valid = entries.gather(1, slots.expand(12, -1, -1)), valid.gather(0, slots)
         support = _support(entries.unflatten(0, (3, 4)), pairs)
         valid = valid & (support > 0)
-        if problem.prior is not None:
-            support = support - problem.prior.disagreement(as_pose(entries.permute(1, 2, 0)))
+        for term in problem.pose_terms:
+            support = support - term.disagreement(as_pose(entries.permute(1, 2, 0)))
         score, best = torch.where(valid, support, -torch.inf).max(0)
         chosen = entries.gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
         return as_pose(torch.where((score > -torch.inf)[:, None], chosen, as_entries(fallback)))

@@ -1,6 +1,7 @@
 """Priors of the pose and of the camera. Each prior is a :class:`~kornia_pnpnet.problem.Term`.
 
-To add a prior, write a class with the methods of ``Term``, and add an instance to ``Problem.terms``.
+To add a prior, write a class with the methods of ``Term``. ``PnPNet._propose`` puts the instances into
+``Problem.pose_terms``.
 """
 
 from __future__ import annotations
