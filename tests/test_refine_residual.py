@@ -13,6 +13,7 @@ from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.problem import Noise, Problem, State
 from kornia_pnpnet.refine import residual
 from kornia_pnpnet.refine.residual import (
+    moved,
     normal_equations,
     pixel_covariance,
     pixel_variance,
@@ -66,6 +67,20 @@ def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, rand
         size = matrix.diagonal().mT.sqrt()
         assert ((found.matrix - matrix) / (size[:, None] * size)).abs().max() < 1e-10
         assert ((found.gradient - gradient) / size).abs().max() < 1e-8 * FOCAL
+
+
+def test_a_zoom_keeps_the_image_of_the_origin(random_rotations):
+    """Its pixel and its scale; the coefficients of distortion add up."""
+    state, problem = scene("pixels", 2, random_rotations(7))
+    state = state._replace(camera=0.0 * state.camera)
+    delta = torch.zeros(8, 7, dtype=torch.float64)
+    delta[6], delta[7] = 0.2, 0.1
+    zoomed = moved(state, delta)
+    torch.testing.assert_close(zoomed.camera, torch.tensor([[0.2, 0.1]], dtype=torch.float64).expand(7, 2))
+    scales = [project(x, problem).focal / x.pose.translation[:, 2] for x in (state, zoomed)]
+    torch.testing.assert_close(*scales)
+    assert zoomed.pose.translation[:, :2].equal(state.pose.translation[:, :2])
+    assert zoomed.pose.rotation.equal(state.pose.rotation)
 
 
 def test_points_behind_the_camera_have_finite_gradients():
