@@ -21,22 +21,22 @@ from kornia_pnpnet.result import Alternatives, Pose
 
 __all__ = ["find_alternatives", "reconsider"]
 
-# Another pose is kept when its likelihood is at least this fraction of the likelihood of the refinement's pose. The
-# logarithm of this ratio is at most the second number, so that its exponential does not overflow.
+# Another pose is kept when the ratio of its likelihood to the likelihood of the refined pose exceeds the first number.
+# The logarithm of the ratio is clipped at the second number, so that the exponential does not overflow.
 _LIKELY, _LIKELIER = 1e-3, 30.0
 # Two poses are the same minimum if their rotations differ by less than this number of radians, and if the mean point
 # moves by less than this share of its distance from the camera.
 _SAME = 0.035
-# A mirror image is refined if most residuals of the inliers are below this number times the spread of the pixels.
+# A mirror image is refined if most inliers have a residual there below this number times the spread of their pixels.
 _NEAR_MIRROR = 0.2
-# Rivals of other noise: least standard deviation in radians, first entry of the evidence's grid of noise that is tried,
-# largest loss of log-likelihood per pair, and largest share of inliers of a pose that has such a rival.
+# Rival with a larger noise: least standard deviation in radians, first entry of `Evidence.grid` with such a noise,
+# largest loss of log-likelihood per vote, and largest share of inliers of a pose that has such a rival.
 _WIDE_ANGLE, _WIDE_FROM, _GAP, _CLEAR = 6.4e-3, 4, 0.4, 0.9
-# The caller's rivals: factor by which the first variance is smaller, least angle from the pose, and largest share of
-# inliers of a pose that has such a rival.
+# The caller's rival: divisor of the initial variance, least angle from the pose in radians, and largest share of
+# inliers of a pose that is compared with the rival.
 _SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.02, 0.97
-# Number of iterations of a rival at its first noise, number of further iterations, and number of iterations from each
-# start of `find_alternatives`.
+# Number of iterations of a rival with constant noise, number of further iterations, and number of iterations from each
+# start in `find_alternatives`.
 _FROZEN, _FREE, _ITERATIONS = 3, 5, 12
 
 
@@ -104,8 +104,8 @@ def reconsider(
 
     One rival starts from the refined pose with a larger noise, if the residuals are almost as likely with this noise.
     Another rival starts from the mirror image of the pose, if the mirror image has small residuals. The caller's rival
-    starts with a smaller noise, if it differs from the pose. A rival that ends more than 10 degrees from the result
-    lowers the probability of the result.
+    is used if it differs from the pose, and starts with a smaller noise. A rival that ends more than 10 degrees from
+    the result lowers the probability of the result.
 
     Args:
         refine: the refiner.
@@ -114,9 +114,9 @@ def reconsider(
         found: the evidence for the refined poses.
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
         rival: the caller's rivals. ``None``: the caller has none.
-        replaced: the problems, bool :math:`(B,)`, whose refined pose the caller does not believe. The caller's rival
-            replaces this pose, and starts with the noise of its own residuals. ``None``: the likelihood decides for
-            every problem. If given, the caller's rivals of the other problems are ignored.
+        replaced: whether the caller's rival replaces the refined pose of a problem, bool, shape :math:`(B,)`. Such a
+            rival starts with the noise of its own residuals. The caller's rivals of all other problems are ignored.
+            ``None``: the likelihood selects the pose of every problem.
 
     Returns:
         For :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for them, and their
@@ -155,7 +155,7 @@ def reconsider(
     for i in range(_FROZEN + _FREE):
         tried = refine.by_residuals(every, tried, every.votes.known | (i < _FROZEN), step, damping)
     of_ends = every.evidence_at(tried.state)
-    # By kind of the rival (0: the refined pose) and by problem, (5, B).
+    # The shape is (5, B). The first index is the kind of the rival; index 0 is the refined pose.
     kind = kind + 1
     likelihood = found.likelihood.new_full((len(kinds) + 1, len(valid)), -torch.inf)
     end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()
@@ -190,7 +190,7 @@ def _moved(points: Tensor, pose: Pose) -> Tensor:
 
 
 def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
-    """Apply a half turn about the plane's normal, then the pose, then a half turn about the line of sight."""
+    """Apply a half turn about the normal of the points' plane, the pose, and a half turn about the line of sight."""
     middle = _mean(problem.world_points, shares)
     centred = problem.world_points - middle[:, None]
     covariance = torch.bmm(centred.mT, shares[..., None] * centred)
@@ -209,7 +209,7 @@ def _half_turn(axis: Tensor) -> Tensor:
 
 
 def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor, ...]:
-    """Solve P3P for three likely pairs that lie far apart. ``fallback`` replaces invalid solutions among the four."""
+    """Solve P3P for three likely pairs that lie far apart. ``fallback`` replaces the invalid ones of the four poses."""
     likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
     points, rows = problem.world_points, torch.arange(len(weights), device=weights.device)[:, None]
 

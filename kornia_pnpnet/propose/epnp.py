@@ -1,16 +1,16 @@
 r"""EPnP: a pose from four or more pairs. A closed-form solution is refined by Gauss-Newton steps in four unknowns.
 
-A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`, with the same coordinates
-:math:`a_{ij}` in the world frame and in the camera frame. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3`
-are *vectors* from the centroid, so that the coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`. (Lepetit
-et al. use four points and barycentric coordinates.)
+A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`. The coordinates :math:`a_{ij}` are
+the same in the world frame and in the camera frame. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3` are
+*vectors* from the centroid, so that the coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`. (Lepetit et
+al. use four points and barycentric coordinates.)
 
 The projection equations are :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0` and :math:`\sum_j a_{ij} (y_j - v_i z_j) = 0`.
 For given depths :math:`z` of the control points, the least-squares solutions are :math:`x = P z` and :math:`y = Q z`,
-with :math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. The four depths remain of the
-paper's 12 unknowns, with the algebraic error :math:`z^\top K z`. The columns of :math:`D(z)` and :math:`L` are the
-control vectors in the camera frame and in the world frame. If :math:`D^\top D = L^\top L`, a rotation or a reflection
-maps :math:`L` to :math:`D`. An array (4, C, B) contains the four depths of C candidates.
+with :math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. Of the paper's 12 unknowns,
+only the four depths remain. Their algebraic error is :math:`z^\top K z`. The columns of :math:`D(z)` and :math:`L` are
+the control vectors in the camera frame and in the world frame. If :math:`D^\top D = L^\top L`, a rotation or a
+reflection maps :math:`L` to :math:`D`. An array (4, C, B) contains the four depths of C candidates.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ __all__ = ["ControlPoints", "EPnP", "control_points"]
 
 # Points are planar when their smallest extent is below this fraction of their middle extent.
 _PLANAR_RATIO = 1e-3
-# A problem needs this number of pairs, and this number of pairs in front of the camera, to be `ok`.
+# Least number of pairs, and least number of pairs in front of the camera, of a problem that is `ok`.
 _MIN_PAIRS, _MIN_IN_FRONT = 4, 3
 # Number of Gauss-Newton steps of each of the four cases, before the best case is chosen.
 _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Ridge, as a share of the squared spread of the pixels. Of null vectors with equal algebraic errors, those along the
-# longest extents of the world come first.
+# Ridge, divided by the squared spread of the pixels. The ridge sorts null vectors of equal algebraic errors: null
+# vectors along the longest extents of the world come first.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
@@ -56,7 +56,7 @@ class ControlPoints(NamedTuple):
 def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    Each of three steps selects the coordinate with the largest variance, and makes the others orthogonal to it. (The
+    Each of three steps selects the coordinate of the largest variance, and orthogonalises the other coordinates. (The
     paper's principal directions have no gradient if two extents are equal.) Pairs with the weight 0 are ignored.
 
     Example:
@@ -163,7 +163,7 @@ class EPnP(Initialiser):
         return Starts(Pose(rotation, translation), torch.ones_like(problem.weights), ok)
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
-        """Depths (4, 1, B) of the best case, and whether this case is valid (B,). An invalid case gets equal depths."""
+        """Depths (4, 1, B) of the best case, and whether this case is valid (B,). If not, all points have one depth."""
         cases = _four_cases(system).detach()  # `no_grad` does not stop forward-mode derivatives
         # A shape and its mirror image along the optical axis have the same distances. Gauss-Newton cannot move
         # from one shape to the other shape, and therefore starts from both shapes.
@@ -219,7 +219,7 @@ def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
 def _null_space(system: _DepthSystem) -> Tensor:
     """A basis v of the depths, z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄, (4, 4 vectors, B), in which K is nearly diagonal.
 
-    The centroid has the depth 1 in v₁, else 0. The algebraic errors of v₂, v₃ and v₄ ascend.
+    The centroid has the depth 1 in v₁, and 0 in v₂, v₃ and v₄. The algebraic errors of v₂, v₃ and v₄ ascend.
     """
     error, eye = system.error, torch.eye(4, dtype=system.error.dtype, device=system.error.device)[..., None]
     spread = error[0, 0] + system.maps[:2, 0, 1:, 0].square().sum((0, 1))
@@ -233,8 +233,8 @@ def _null_space(system: _DepthSystem) -> Tensor:
 def _four_cases(system: _DepthSystem) -> Tensor:
     r"""The depths (4, 4 cases, B) of the paper's four cases, with 1, 2, 3 and 4 null vectors.
 
-    Linear least squares find products of the coefficients :math:`\beta`. Without the smallest product
-    :math:`\beta_3^2`, six equations have six unknowns. All linear systems are leading blocks of one system.
+    Linear least squares find products of the coefficients :math:`\beta`. Six equations determine at most six products.
+    Small products such as :math:`\beta_3^2` are ignored. All linear systems are leading blocks of one system.
     """
     basis = _null_space(system)
     vectors = _in_camera(system, basis)[:, 1:]  # (3 axes, 3 vectors, 4 null vectors, B)
@@ -276,9 +276,9 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 
 
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
-    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem; 0 if a minimum is not isolated.
+    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem. Minima that are not isolated get 0.
 
-    Two Newton steps with a constant matrix, which do not change the values, make first and second derivatives exact.
+    Two Newton steps with a constant matrix make first and second derivatives exact. The values do not change.
     """
     with torch.no_grad():
         normal, _, misfit = _normal_equations(system, depths)
@@ -306,7 +306,7 @@ def _frames(one: Tensor, two: Tensor) -> Tensor:
 def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
     """Index (B,) of the case with the least weighted sum of squared reprojection errors.
 
-    The frames of the first two control vectors give an approximate rotation, faster than Procrustes.
+    The frames of the first two control vectors give an approximate rotation. This is faster than Procrustes.
     """
     camera, world = _in_camera(system, cases), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
     camera_frames, world_frame = _frames(camera[:, 1], camera[:, 2]), _frames(world[:, 0], world[:, 1])

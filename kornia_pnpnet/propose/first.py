@@ -21,12 +21,12 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["propose"]
 
-# Focal lengths. A pair that is not of normal scale is used only if its residual at some first pose is smaller.
+# An unusual pair (`Problem.usual`) is used only if its residual at a first pose is below this number of focal lengths.
 _SEEN = 0.25
 # Inlier threshold for rigs, in focal lengths.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
-# With a fixed effort, RANSAC solves this number of samples, and this number of pairs scores each pose.
+# Number of samples that RANSAC solves with a fixed effort, and number of pairs that score each pose.
 _SAMPLES, _JUDGES = 128, 32
 # The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, 2018).
 _ROOT = 1.2207440846057596
@@ -78,7 +78,7 @@ def propose(
 
 @torch.no_grad()
 def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool) -> Starts:
-    """The pose of a rig, its inliers, and the noise that their residuals show, for the arguments of `propose`."""
+    """Find the pose of a rig, the inliers, and the noise of their residuals if ``with_noise``. See `propose`."""
     problem = problem.map(torch.Tensor.detach)
     if fixed or not sees_values(problem.weights):
         starts = _of_fixed_effort(problem._replace(weights=relative(problem.weights, problem.weights), noise=None))
@@ -110,7 +110,7 @@ def _of_fixed_effort(problem: Problem) -> Starts:
 def _drawn(order: Tensor, counts: Tensor) -> Tensor:
     """Draw samples (B, S, 3) of different pairs from the first ``counts`` (B, 1) positions in ``order`` (B, N)."""
     numbers = torch.arange(1, _SAMPLES + 1, dtype=torch.float64, device=order.device)
-    # The second and the third number are ranks among the pairs that are left.
+    # The second and the third number are ranks among the pairs that the sample does not contain yet.
     first, second, third = ((numbers * _ROOT**-k % 1.0 * (counts - k + 1)).long() for k in (1, 2, 3))  # (B, S) each
     second = second + (second >= first)
     third = third + (third >= torch.minimum(first, second))

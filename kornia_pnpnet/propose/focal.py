@@ -26,27 +26,27 @@ __all__ = ["as_dist", "distorted", "find_focal", "scale_focal", "with_found_foca
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
-# Half the width of a square, divided by the median distance (maximum norm) of uniform points from the centre.
+# Half the width of a square, divided by the median distance (maximum norm) of uniformly random points from the centre.
 _HALF_WIDTH = math.sqrt(2.0)
-# If the caller expects a focal length, the search covers this number of standard deviations of log f on either side.
+# Half the range of log f in standard deviations, if the caller expects a focal length.
 _SEARCHED = 2.0
 # Inlier threshold in pixels of the normalised camera: 0.65 % of half the image width at the middle of the range.
 _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
-# For problems that the refinement did not solve, and that further iterations of the refinement follow.
+# RANSAC for problems that the refinement did not solve. Further iterations of the refinement follow.
 _FURTHER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, min_samples=64, final_steps=1)
-# Number of steps of `_with_distortion`. A lower bound of the kernel's scale (in focal lengths): its first value (at a
-# radius of 0.7, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07), its factor from step to step, and its least value.
+# Number of steps of `_with_distortion`. Lower bound of the kernel's scale in focal lengths: value in the first step (at
+# a radius of 0.7, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07), factor from step to step, and least value.
 _STEPS, _WIDE, _SHRINK, _LEAST = 14, 0.07, 0.6, 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> Inputs:
     """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
 
-    The range lies around the caller's focal length, if its log has the standard deviation ``sigma``. Otherwise it is
-    proportional to the size of the image: twice the principal point or, if larger, the extent of the pixels. Aspect
-    ratio and signs of fx and fy are kept. Matrices that are no pinhole cameras become NaN. ``radial`` is the number of
-    coefficients of radial distortion to estimate.
+    With ``sigma``, the standard deviation of log f, the range lies around the caller's focal length. Otherwise the
+    range is proportional to the size of the image. The size is twice the principal point or, if larger, the extent of
+    the pixels. Aspect ratio and signs of fx and fy are kept. Matrices that are no pinhole cameras become NaN.
+    ``radial`` is the number of coefficients of radial distortion to estimate.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = focal_length(camera)  # (B,)
@@ -109,9 +109,9 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 @torch.no_grad()
 def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, Tensor]:
-    """Replace pose and focal length of problems that are ``doubted`` (B,) by those of RANSAC.
+    """Run RANSAC on problems that are ``doubted`` (B,), and replace their poses and focal lengths.
 
-    Also returns in which problems RANSAC found a pose, bool (B,).
+    Also returns for which problems RANSAC found a pose, bool (B,).
     """
     rows = doubted.nonzero()[:, 0]
     if not len(rows):

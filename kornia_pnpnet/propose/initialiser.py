@@ -15,18 +15,18 @@ __all__ = ["Initialiser", "trait"]
 class Initialiser(Configured):
     """A module that maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
 
-    Any module with the same ``forward`` is an initialiser. The defaults below replace attributes that it lacks.
+    Any module with this ``forward`` is an initialiser. If the module lacks an attribute, the default below applies.
 
     Attributes:
         pairs_at_once: largest number of pairs per thread in a part of a batch. On a CPU and without gradients, solvers
-            split a batch into parts that fit the CPU's caches. ``None`` if batches are not split.
+            split a batch into parts that fit the CPU's caches. ``None``: batches are not split.
         fixed_pairs: whether the number of pairs has to be ``config["n"]``.
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.
         finds_focal: whether the initialiser estimates an unknown focal length.
-        estimates_noise: whether the result contains several poses and the noise. The initialiser then accepts
+        estimates_noise: whether the result contains several poses and the noise. Such an initialiser accepts
             ``forward(problem, search_follows=True)``.
-        weighs_unusual: whether the weights of pairs that are not of normal scale are also valid.
+        weighs_unusual: whether the weights of unusual pairs (see ``Problem.usual``) are also valid.
     """
 
     pairs_at_once: int | None = None
@@ -43,5 +43,5 @@ class Initialiser(Configured):
 
 
 def trait(init: nn.Module | None, name: str) -> Any:
-    """An attribute of an initialiser, or its default."""
+    """Get an attribute of an initialiser, or the default if the initialiser lacks the attribute."""
     return getattr(init, name, getattr(Initialiser, name))

@@ -24,7 +24,7 @@ class MinimalSolver(Protocol):
         """Number of pairs in a sample."""
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Find the poses of normalised samples, which are problems of ``sample_size`` pairs. Weights are ignored.
+        """Find the poses of samples. A sample is a normalised problem of ``sample_size`` pairs. Weights are ignored.
 
         If the focal length is unknown, the last row of each rotation and of each translation is multiplied by
         ``problem.focal`` and divided by the estimated focal length.

@@ -17,7 +17,7 @@ __all__ = ["MLPInit", "rotation_about"]
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Module]:
-    """Linear layers with ReLU and He initialisation. PyTorch's default loses the signal in ten narrow layers."""
+    """Make linear layers with ReLU and He initialisation. With PyTorch's default, ten narrow layers lose the signal."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         linear = nn.Linear(size_in, size_out)
@@ -62,8 +62,8 @@ class MLPInit(Initialiser):
     branch follow. Each branch has five ReLU layers of 2n units and a linear last layer. The rotation branch returns an
     axis :math:`s` and an angle :math:`\theta`. The rotation is :math:`R = \exp(\theta [s / \|s\|]_\times)`.
 
-    Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are ours. The network computes in the wider of
-    its own dtype and the dtype of the problem.
+    Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are ours. The network computes in its own dtype
+    or in the dtype of the problem, whichever is wider.
 
     Args:
         n: number of pairs.
@@ -80,7 +80,7 @@ class MLPInit(Initialiser):
     """
 
     fixed_pairs = True
-    weighs_unusual = True  # pairs that are not of normal scale have a weight of 0
+    weighs_unusual = True  # unusual pairs have the weight 0
 
     def __init__(self, n: int, *, world_scale: float = 1.0, img_scale: float = 1000.0) -> None:
         super().__init__(locals())
@@ -98,11 +98,11 @@ class MLPInit(Initialiser):
         """Find a coarse pose.
 
         Args:
-            problem: ``n`` pairs, sorted by their pixels. The coordinates of pairs that are not of normal scale are
+            problem: ``n`` pairs, sorted by their pixels. The coordinates of unusual pairs (see ``Problem.usual``) are
                 replaced by 0.
 
         Returns:
-            The coarse pose and the weights. The weight is 1 for pairs of normal scale, and 0 for other pairs.
+            The coarse pose and the weights. The weight of a usual pair is 1, the weight of an unusual pair is 0.
 
         Raises:
             ShapeError: when the number of pairs is not ``n``.

@@ -37,21 +37,21 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3P", "minimal_poses", "p3p"]
 
-# Bytes of a vector that has one number per problem of a chunk. A core's caches hold a few dozen of these vectors.
+# Size in bytes of a vector with one number per problem of a chunk. A core's caches hold a few dozen of these vectors.
 _CHUNK_BYTES = 2**16
-# A candidate is a solution if its triangle differs from the world triangle, whose longest edge is 1, by less than
-# eps^_ERROR_POWER times the distance of the camera, and by less than _LARGEST_ERROR.
+# A candidate is a solution if its triangle differs from the world triangle by less than eps^_ERROR_POWER times the
+# distance of the camera, and by less than _LARGEST_ERROR. The longest edge of the world triangle has the length 1.
 _ERROR_POWER, _LARGEST_ERROR = 2 / 3, 0.01
-# Least distance of the camera from a point, in units of eps^_ERROR_POWER longest edges. At a smaller distance, rounding
-# would determine the ray of the point.
+# Least distance of the camera from a point, divided by eps^_ERROR_POWER times the longest edge. At a smaller distance,
+# rounding would determine the ray of the point.
 _CLOSE = 64.0
-# A triangle counts as a line when its height, over its size and its distance from the origin, is below this number of
-# machine epsilons.
+# A triangle counts as a line when its height is below _LINE * eps * sqrt(b^2 + d^2). Here b is the longest edge, and d
+# is the distance of the opposite point from the origin.
 _LINE = 32.0
-# Newton steps for the root of the cubic. They reduce a relative error of 37 % to rounding in float64.
+# Number of Newton steps for the root of the cubic, which reduce a relative error of 37 % to rounding in float64.
 _CUBIC_STEPS = 4
-# A Newton step for the ratios is damped if its squared determinant is below this power of the machine epsilon times two
-# squared edges: when two solutions nearly coincide, the full step would be noise.
+# A Newton step for the ratios is damped if its squared determinant is below eps^_DAMPING_POWER times the product of two
+# squared edges. When two solutions nearly coincide, rounding errors would dominate the full step.
 _DAMPING_POWER = 1.25
 # Number of focal lengths in the grid of an unknown focal length.
 _FOCALS = 12
@@ -88,7 +88,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """The real root ``u : v`` of a cubic form (4, C) that is farthest from the other two roots.
 
-    When two solutions of a P3P problem nearly coincide, two roots do, too. The third root has the line of both.
+    When two solutions of a P3P problem nearly coincide, two roots also do. The third root gives a line with both.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -226,7 +226,7 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 
 
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Unit vectors along the base and the height of a triangle, 1 / base, the side along the base, and the height².
+    """Unit vectors along base and height of a triangle, 1 / base, the component of the side along the base, and height².
 
     The triangle is given by its base and another side, both (3, *, C).
     """
@@ -268,7 +268,7 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
     det = _dot(_cross(gaps[1], gaps[2]), rays[0])
     dist = _distances(p, q, r, gaps.square_().sum(1), det.mul_(det))
 
-    # Up to here the longest edge has the length 1. From here on lengths have the unit of the world points.
+    # Up to here, the longest edge has the length 1. From here on, lengths have the unit of the world points.
     base_length = inv_base.reciprocal()
     y1, y2, y3 = (dist * base_length)[:, None] * rays[:, :, None, None]
     cam1, cam2, cam_inv_base, cam_along, cam_sq_height = _axes(y3 - y2, y1 - y2)
@@ -299,7 +299,7 @@ def _solve(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     out = world_points.new_empty(3, 4, 2, 2, batch)
     valid = torch.empty(2, 2, batch, dtype=torch.bool, device=world_points.device)
     chunk = kept_at_once(_CHUNK_BYTES, world_points) // world_points.element_size()
-    with torch.inference_mode():  # faster than `no_grad` by an eighth
+    with torch.inference_mode():  # an eighth faster than `no_grad`
         for start in range(0, batch, chunk):
             part = slice(start, start + chunk)
             rotation, translation, valid[..., part] = _solve_chunk(world_points[part], plane_points[part])
@@ -331,9 +331,9 @@ class _Solve(torch.autograd.Function):
 
 
 def minimal_poses(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype, whose fifth powers neither overflow nor underflow.
+    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype. Fifth powers must neither overflow nor underflow.
 
-    Returns the entries (12, 4, B) of :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which are valid, (4, B).
+    Returns the entries (12, 4, B) of :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which slots are valid, (4, B).
     """
     entries, valid = (_solve if compiling() else _Solve.apply)(world_points.detach(), plane_points.detach())
     return entries, valid
@@ -397,7 +397,7 @@ class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
     If the focal length is unknown, :func:`p3p` solves each sample at every focal length of a grid with constant ratios
-    (see :class:`~kornia_pnpnet.refine.terms.CameraTerm`). Refinement on all inliers then leaves the grid.
+    (see :class:`~kornia_pnpnet.refine.terms.CameraTerm`). Values between those of the grid are left to the refinement.
 
     Example:
         >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))

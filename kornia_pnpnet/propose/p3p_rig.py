@@ -7,9 +7,9 @@ direction :math:`r_k`. The unknowns are the distances :math:`d_k > 0` along the 
 .. math:: \|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2.
 
 There are up to eight solutions (D. Nistér, "A minimal solution to the generalised 3-point pose problem", CVPR 2004).
-For a given :math:`d_1`, two of the equations have up to two solutions :math:`d_2` and :math:`d_3`, which are real in
-one interval of :math:`d_1`. On each of the four branches, the third equation is a function of :math:`d_1` alone. We
-evaluate these functions at a few distances. Newton's method starts where the sign of a function changes.
+For a given :math:`d_1`, one equation has up to two solutions :math:`d_2`, and another has up to two solutions
+:math:`d_3`. Both are real in one interval of :math:`d_1`. On each of the four branches, the third equation is a
+function of :math:`d_1` alone. Newton's method starts where the sign of one of these functions changes.
 
 The last dimension of every tensor is the batch of B problems or M solutions.
 """
@@ -29,13 +29,13 @@ from kornia_pnpnet.propose.scoring import as_pose
 
 __all__ = ["P3PRig"]
 
-# Number of distances at which a function is evaluated. Two solutions between neighbouring distances are missed: 4 % of
-# the poses if cameras look in all directions.
+# Number of distances d_1 at which each function is evaluated. Two solutions between neighbouring distances are missed.
+# If cameras look in all directions, 4 % of the poses are missed.
 _DISTANCES = 16
 # Largest number of solutions, and number of Newton steps.
 _SOLUTIONS, _STEPS = 8, 6
-# A pose is a solution when the relative error of each side of the triangle, and the difference of the product of the
-# transposed and the rotation matrix from the identity, are below these numbers.
+# A pose is a solution when the relative error of each side of the triangle is below the first number, and each entry of
+# RᵀR - I is below the second number. Here R is the rotation matrix.
 _EXACT, _ORTHOGONAL = 1e-3, 0.01
 
 
@@ -60,7 +60,7 @@ class _Branches(NamedTuple):
         return cls(ahead, 1.0 + gain, offset - ahead * ray, change - gain * ray, sq_side)
 
     def interval(self) -> tuple[Tensor, Tensor]:
-        """The limits of the distance of pair 1 between which the solutions are real; an empty interval is reversed."""
+        """Least and largest distance of pair 1 with real solutions. Without real solutions, the least distance is larger."""
         sq_tilt = self.tilt.square().sum(0).clamp(min=torch.finfo(self.tilt.dtype).eps ** 2)  # for parallel rays
         middle = -(self.aside * self.tilt).sum(0) / sq_tilt
         sq_half = middle.square() + (self.sq_side - self.aside.square().sum(0)) / sq_tilt
@@ -114,7 +114,7 @@ def _starts(
     low, high = torch.maximum(*lows).clamp(min=0.0), torch.minimum(*highs)
     real = high > low
     middle, half = 0.5 * (low + high), torch.where(real, 0.5 * (high - low), 0.0)
-    # At an end of the interval, the distances behave like square roots. With an angle as the variable, they are smooth.
+    # At an end of the interval, d_2 and d_3 behave like square roots. They are smooth functions of the angle `turn`.
     turn = torch.linspace(-0.5 * math.pi, 0.5 * math.pi, _DISTANCES, dtype=sq_side.dtype, device=device).sin()[:, None]
     distances = middle + half * turn  # (D, B)
     signs = torch.tensor([-1.0, 1.0], dtype=sq_side.dtype, device=device)[:, None, None]
@@ -123,7 +123,7 @@ def _starts(
     linear = (2.0 * offset * rays[1:]).sum(1)  # (2, B)
     wide = (rays[1] - rays[2]).square().sum(0)
     alone = linear[0] * second + (offset.square().sum(0) - sq_side), linear[1] * third
-    # The third equation. The square of a difference and `wide` lose no digits in a narrow field of view.
+    # `gap` is the error of the third equation. The square of a difference and `wide` lose no digits in a narrow view.
     gap = (second[:, None] - third).square() + (wide * second)[:, None] * third + (alone[0][:, None] - alone[1])
     above = gap.flatten(0, 1) > 0  # (4, D, B)
     changes = ((above[:, 1:] != above[:, :-1]) & real).flatten(0, 1)  # (4 (D - 1), B)
@@ -158,7 +158,7 @@ def _newton(
         steps_by_det = torch.stack((g * d * e + b * both, a * both + g * c * f, b * c * k + e * (g * c - a * h)))
         ranges = ranges + steps_by_det / (a * d * e - b * c * f)
     exact = (gap.abs() < _EXACT * sides).all(0) & (ranges > 0).all(0)
-    # The rotation maps two sides and the normal of the world triangle to their counterparts of the camera triangle.
+    # The rotation maps two sides and the normal of the world triangle to those of the camera triangle.
     cam = [-edge[0], -edge[1], torch.linalg.cross(edge[0], edge[1], dim=0)]
     world = [world_points[1] - world_points[0], world_points[2] - world_points[0]]
     normal = torch.linalg.cross(*world, dim=0)

@@ -25,8 +25,8 @@ __all__ = ["RANSAC", "search_on"]
 
 # A pose can fit this number of inliers closely even if their pixels are noisy.
 _FITTED = 5
-# Largest residuals of an inlier in `search_on`, in standard deviations. The first limit is for the noise that a network
-# estimates, which is too small when most pairs are outliers. The second limit is for the caller's noise.
+# Largest residuals of an inlier in `search_on`, in standard deviations. The first limit is for noise that a network
+# estimates. Such estimates are too small when most pairs are outliers. The second limit is for the caller's noise.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Least inlier threshold for an unknown focal length, divided by the median distance of the pixels from the principal
 # point and by half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
@@ -42,15 +42,15 @@ class RANSAC(Initialiser):
     r"""The pose with the best score among the poses of many samples, improved on its inliers.
 
     The samples of all problems are solved as one batch, in rounds. After each round the best pose of a problem is
-    improved by least squares on its inliers (LO-RANSAC). A problem is done when a sample without an outlier has been
-    drawn with the probability ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
-    drawn twice. The random numbers are the same for every problem and call, so that the result of a problem does not
-    depend on the batch, up to rounding. Pairs of a large confidence are drawn more often than other pairs.
+    improved by least squares on its inliers (LO-RANSAC). The search of a problem ends when the probability that a
+    sample without outliers was drawn reaches ``confidence``. If a problem has at most ``max_samples`` possible samples,
+    no sample is drawn twice. All problems and calls share the same random numbers, so that, up to rounding, the result
+    of a problem does not depend on the batch. Pairs of a large confidence are drawn more often than other pairs.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
     least squares, the weight of an inlier is the inverse of the right-hand side. The final steps multiply this weight
     by the weight of a Cauchy kernel. They start from a constant pose close to the minimum, and have gradients with
-    respect to points, pixels and weights. The inliers, and their weights by depth, are constants.
+    respect to points, pixels and weights. The choice of inliers, and the right-hand side, have no gradient.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
@@ -179,7 +179,7 @@ class RANSAC(Initialiser):
 
 
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
-    """Weights (B, N) of a Cauchy kernel by the inliers' median residual, because thresholds are wide."""
+    """Weights (B, N) of a Cauchy kernel. Thresholds are wide, so that the inliers' median residual gives the scale."""
     there = inliers > 0
     sq_scale = cauchy_scale(errors, there).clamp(min=torch.finfo(errors.dtype).eps)
     # With few inliers, the median residual underestimates the noise. All weights are then closer to 1.
@@ -201,14 +201,14 @@ def _trusted(problem: Problem) -> Tensor:
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, State]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    A problem is searched only when it needs more than 64 samples for a confidence of 0.999, by the inliers of the best
-    pose of the starts (improved by least squares). The weight :math:`w` of a pair in the starts makes its chance to be
-    drawn proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
+    Least squares improve the best pose of the starts. A problem is searched only if the inliers of this pose require
+    more than 64 samples for a confidence of 0.999. A pair of the weight :math:`w` in the starts is drawn with a chance
+    proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
-    A pair is an inlier if its residual is below ten standard deviations, or five if the caller gave the noise of the
-    pair. If the caller gave no noise, all pairs have the mean of the estimated standard deviations. Noise of points is
-    converted to pixels at the depth of the world's origin in the first pose. If each pose used its own depths, a pose
-    close to the points would have the most inliers.
+    A pair is an inlier if its residual is below ten standard deviations, or below five if the caller gave the noise of
+    the pair. If the caller gave no noise, all pairs have the mean of the estimated standard deviations. Noise of points
+    is converted to pixels at the depth of the world's origin in the first pose. If each pose used its own depths, a
+    pose close to the points would have the most inliers.
 
     Args:
         problem: normalised problems of a centred and scaled world.
@@ -217,9 +217,9 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
             from the correct pose.
 
     Returns:
-        First, the starts with the best pose, without gradient. A searched problem has the weights of a Cauchy kernel at
-        the best pose, with the inlier threshold as its scale. Second, the best pose by a quarter of the thresholds, a
-        rival of the refined pose.
+        First, the starts with the best pose, without gradient. In a searched problem, a Cauchy kernel at the best pose,
+        with the inlier threshold as its scale, gives the weights. Second, the best pose by a quarter of the thresholds,
+        a rival of the refined pose.
 
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.

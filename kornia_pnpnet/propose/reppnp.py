@@ -1,9 +1,9 @@
 r"""EPPnP and REPPnP: a pose from the null space of the projection equations. REPPnP also rejects outliers.
 
 A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residuals are the algebraic
-errors. Unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). In an array
-``rows`` (B, K + 1, 2 N), the first K rows are the derivatives of the errors by K unknowns, and the last row is the
-errors, first in u and then in v.
+errors. The unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). In an
+array ``rows`` (B, K + 1, 2 N), the first K rows are the derivatives of the errors by K unknowns, and the last row holds
+the errors. In each row, N entries for u precede N entries for v.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ __all__ = ["REPPnP"]
 
 # Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
-# Outlier rejection keeps at least this number of pairs: the 6 pairs of a null vector, or the 3 pairs of a rigid motion,
-# and one or two further pairs.
+# Outlier rejection keeps at least this number of pairs. A null vector needs 6 pairs, a rigid motion needs 3 pairs. One
+# or two further pairs are kept.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
 # A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4
-# Ridges on the depths of the control vectors during and after outlier rejection. In the end, a large ridge would
+# Ridges on the depths of the control vectors during and after outlier rejection. In the final pose, a large ridge would
 # suppress the small depths of a narrow view.
 _DEPTH_PRIOR, _FINAL_DEPTH_PRIOR = 5e-3, 1e-5
 # This number is added to 1 minus the leverage of a pair, because the leverage can be 1.
@@ -100,9 +100,9 @@ class REPPnP(Initialiser):
         """Find the pose and the inliers of a problem in the solver's frame.
 
         Returns:
-            The pose, weights, and ``ok``. The weight is 1 for kept pairs and pairs not of normal scale, else 0. A
-            problem is not ``ok`` with fewer than 4 pairs, with points on a line, if the equations do not determine a
-            pose, or if the centroid of the points is behind the camera.
+            The pose, weights, and ``ok``. The weight is 1 for kept pairs and for unusual pairs (see ``Problem.usual``),
+            and 0 for other pairs. A problem is not ``ok`` with fewer than 4 pairs, with points on a line, if the
+            equations do not determine a pose, or if the centroid of the points is behind the camera.
         """
         problem = problem._replace(weights=problem.usual_weights)
         with torch.no_grad():
@@ -129,7 +129,7 @@ class REPPnP(Initialiser):
         ok = ok & (pose.translation[:, 2] > 0)
         offset = (pose.rotation @ centroid)[..., 0]
         pose = Pose(pose.rotation, pose.translation * radius[:, None] - offset)
-        kept = (weights > 0) | (problem.usual == 0)  # pairs not of normal scale are left to the solver
+        kept = (weights > 0) | (problem.usual == 0)  # the solver decides about unusual pairs
         return Starts(pose, kept.to(problem.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs, control: ControlPoints) -> tuple[Tensor, Pose]:
@@ -224,8 +224,8 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
 def _leave_one_out(rows: Tensor, inverse: Tensor, pairs: _Pairs, weights: Tensor) -> Tensor:
     r"""Squared leave-one-out errors :math:`e^\top (1 \mp w H)^{-1} e` (B, N) with the leverage :math:`H`.
 
-    This is the change of the cost, over the weight :math:`w`, if a kept pair is removed (minus) or a rejected pair is
-    added (plus).
+    The error is the change of the cost, divided by the weight :math:`w`, when a kept pair is removed (minus) or a
+    rejected pair is added (plus).
     """
     jacobian, count = rows[:, :-1], weights.shape[-1]
     solved = inverse @ jacobian

@@ -15,10 +15,10 @@ from kornia_pnpnet.core.performance import present_first
 
 __all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed", "spread_evenly"]
 
-# Number of nearest neighbours of a pair that are compared. They are searched among at most the second number of pairs,
-# a power of two, so that the cost is linear in the number of pairs.
+# Number of nearest neighbours that are compared for each pair, and largest number of pairs among which neighbours are
+# searched, so that the cost is linear in the number of pairs. The second number is a power of two for the bit masks.
 _NEIGHBOURS, _CANDIDATES = 16, 512
-# The bits of an infinite float32.
+# The bits of the float32 infinity, read as an integer.
 _INFINITE = 0x7F800000
 # Number of distances that are computed at once on a CPU, so that they fit into a core's cache.
 _BLOCK = 2**18
@@ -33,10 +33,10 @@ def kept_at_once(count: int, like: Tensor) -> int:
 
 @torch.no_grad()
 def spread_evenly(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of present pairs, evenly spread. If these pairs are too few, absent pairs are added.
+    """Positions (B, count) of present pairs, evenly spread. With fewer than ``count`` such pairs, absent pairs follow.
 
-    Multiples of the golden ratio shift the positions slightly, because the selection could follow a periodic pattern in
-    the order of the pairs. No position occurs twice, unless fewer than ``count`` pairs exist.
+    Multiples of the golden ratio shift the positions slightly, so that the selection does not follow a periodic pattern
+    in the order of the pairs. No position occurs twice, unless the problem has fewer than ``count`` pairs.
     """
     steps = torch.arange(count, dtype=torch.float64, device=present.device)
     total = present.sum(1, keepdim=True).clamp(min=count)
@@ -46,7 +46,7 @@ def spread_evenly(present: Tensor, count: int) -> Tensor:
 
 
 def draw(numbers: Tensor, upper: Tensor) -> Tensor:
-    """Draw subsets (P, H, s) without replacement. Items of probability 0 are drawn only if no others are left.
+    """Draw subsets (P, H, s) without replacement. Items of probability 0 are drawn only if no other items are left.
 
     ``numbers`` (H, s) are uniform in [0, 1). ``upper`` (P, N) are the cumulative probabilities of the items.
     """
@@ -73,9 +73,9 @@ def draw(numbers: Tensor, upper: Tensor) -> Tensor:
 def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Tensor) -> Tensor:
     r"""Agreement (B, N) between each pair's nearest neighbours in the image and its nearest neighbours in the world.
 
-    An inlier has common neighbours in both spaces, an outlier only by chance. A common neighbour with the rank
-    :math:`a` in the image and the rank :math:`b` in the world adds :math:`1 / (1 + \max(a, b))` to the agreement. Pairs
-    with equal pixels or equal points do not count, because such pairs often repeat one incorrect match.
+    An inlier has common neighbours in the image and in the world. An outlier has common neighbours only by chance. A
+    common neighbour of rank :math:`a` in the image and rank :math:`b` in the world adds :math:`1 / (1 + \max(a, b))` to
+    the agreement. Pairs with equal pixels or points do not count, because they often repeat one incorrect match.
 
     Source: J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature correspondence", CVPR 2017
     (the idea, for matches between two images).
@@ -108,7 +108,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
 
 
 class Samples:
-    """The samples that RANSAC tries: each subset of pairs in a random order, or ``most`` samples if there are more.
+    """The samples that RANSAC tries: all subsets of pairs, shuffled, or ``most`` random samples of more subsets.
 
     Args:
         chances: relative chances that pairs are drawn, (B, N); 0: never.
@@ -138,7 +138,7 @@ class Samples:
         self._upper = self._share.gather(1, self._order).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        """Positions (P, H, s) of the pairs in the samples ``start`` to ``stop - 1``, or repeats, of problems (P,)."""
+        """Positions (P, H, s) of the pairs in samples ``start`` to ``stop - 1`` of problems (P,). Samples may repeat."""
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
         if self._numbers is not None:
@@ -149,7 +149,7 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        The inverse of the inliers' mean chance, weighted by the chances, replaces the number of pairs.
+        The number of pairs becomes the inverse of the inliers' mean chance, where the chances also weight the mean.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)

@@ -28,7 +28,7 @@ __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 #: Maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
-# The squared distance of a point behind the camera is increased by this number times the depth, beyond MAX_ERROR.
+# For a point behind the camera, this number times the depth is added to the numerator, so that e exceeds MAX_ERROR.
 _BEHIND = 1e15
 
 
@@ -61,8 +61,8 @@ class Scene(NamedTuple):
     r"""The pairs of some problems in the form that scoring requires.
 
     Attributes:
-        rows: :math:`x - z\,b_u/f`, :math:`y - z\,b_v/f` and :math:`z \tau / f` as linear functions of a pose. Each has
-            twelve coefficients for the entries of :func:`as_pose`, and a constant. Shape :math:`(P, 3, N, 13)`.
+        rows: :math:`x - z\,b_u/f`, :math:`y - z\,b_v/f` and :math:`z \tau / f` as linear functions of a pose. Each
+            function has a coefficient per entry of :func:`as_pose`, and a constant. Shape :math:`(P, 3, N, 13)`.
         weights: weights of the pairs, shape :math:`(P, 1, N)`.
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)` or :math:`(P, N, 1)`.
         terms: priors of the poses.
@@ -113,7 +113,7 @@ class Scene(NamedTuple):
     def errors(self, poses: Tensor) -> Tensor:
         """Standardised squared residuals (P, N, H) of every pair at every pose (P, 12, H), at most MAX_ERROR.
 
-        The residual of a point behind the camera is MAX_ERROR. No mask is used, because masking would take longer.
+        The residual of a point behind the camera is MAX_ERROR. A mask for these points would take longer.
         """
         rows = self.rows.flatten(1, 2)
         x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)

@@ -29,11 +29,11 @@ CAUCHY = 3.4
 
 # Poses are compared and improved in this dtype. At a focal length of 3400 px, rounding errors are about 1e-4 px.
 _DTYPE = torch.float32
-# On a CPU, at most this number of samples is solved and scored at once, so that the tensors fit into a core's caches.
+# Largest number of samples that a CPU solves and scores at once, so that the tensors fit into a core's caches.
 _SAMPLES_AT_ONCE = 8192
-# Number of samples in a round, divided by the number of samples before the round, and its largest number.
+# Number of samples in a round, divided by the number of earlier samples, and largest number of samples in a round.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
-# One round draws all remaining samples if they would take at most this number of rounds, or if they are few.
+# A round draws all remaining samples if these fill at most the first number of rounds, or are at most the second number.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
 # After k samples, the first scoring of a round uses the maximum of the first number and the second number * k^(1/3)
 # pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then
@@ -42,9 +42,9 @@ _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
 # were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
-# Slots times pairs of a problem. Up to this number, scoring the empty slots of samples is faster than removing them.
+# Up to this number of slots times pairs of a problem, scoring the empty slots is faster than removing the empty slots.
 _FEW_RESIDUALS = 4096
-# In each round, this number of poses with the smallest losses is improved. The best of them is then improved again.
+# Number of poses with the smallest losses that each round improves. The best improved pose is then improved again.
 _IMPROVED = 3
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
@@ -55,11 +55,11 @@ _DAMPING = 1e-6
 # Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
 # the pose of a minimal sample than at an improved pose.
 _LIMITS = 3.0, 1.0
-# If `pose_sigma` exceeds the first number, at least the second number of samples is drawn. An incorrect pose may then
-# have as many inliers as the correct pose, for example in a flat scene and a narrow field of view.
+# If `pose_sigma` exceeds the first number, an incorrect pose may have as many inliers as the correct pose, for example
+# in a flat scene and a narrow field of view. At least the second number of samples is then drawn.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
-# After this number of samples, which take as long as `agreement_of_neighbours`, the chance that a pair is drawn is
-# multiplied by (a + agreement)^b. The numbers a and b were chosen empirically.
+# After this number of samples, the chance that a pair is drawn is multiplied by (a + agreement)^b. The samples take as
+# long as `agreement_of_neighbours`. The numbers a and b were chosen empirically.
 _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
@@ -94,7 +94,7 @@ class Search:
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
-        rivals: the best pose of each problem by a quarter of the thresholds, not improved, shape :math:`(B, 12)`.
+        rivals: the best pose of each problem at a quarter of the thresholds, without improvement, :math:`(B, 12)`.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Search:
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, self.thresholds, _DTYPE)
-        # The numbers of a pair are adjacent, so that one operation selects pairs. Shape (B, N, 6), (B, N, 18) for rigs.
+        # The numbers of a pair are adjacent, so that one operation selects pairs: (B, N, 6), or (B, N, 18) for rigs.
         rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
         self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
         self.low = self.pairs.to(_DTYPE)
@@ -137,11 +137,11 @@ class Search:
 
         Args:
             given: poses that compete with the poses of the samples, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
-            enough: a problem with given poses is searched only if it needs more than this number of samples, by the
-                inliers of its best pose.
+            enough: a problem with given poses is searched only if the inliers of its best pose require more than this
+                number of samples.
 
         Returns:
-            The positions of the problems of which samples were drawn.
+            The indices, in the batch, of the problems of which samples were drawn.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -225,8 +225,8 @@ class Search:
     def _expect(self, at: Tensor) -> None:
         """Estimate how many samples some problems need, from the inliers of their best poses.
 
-        After `_prefer_agreement`, this is the geometric mean of the numbers with and without agreement. On repeated
-        structure, neighbours of outliers agree, and the first number alone could end the search early.
+        After `_prefer_agreement`, the estimate is the geometric mean of the numbers with and without agreement. On
+        repeated structure, neighbours of outliers agree. The number with agreement could then end the search early.
         """
         if not len(at):
             return
@@ -353,7 +353,7 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
     """Repeat the first row until the number of rows is a multiple of `_VECTOR`, unless each row has many pairs.
 
-    Processors round differently in partly filled vectors. A result would depend on the position in the batch.
+    Processors round differently in partly filled vectors, so that results would depend on the position in the batch.
     """
     if compiling() or pairs > _VECTOR:
         return rows
