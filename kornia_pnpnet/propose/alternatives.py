@@ -27,13 +27,13 @@ _LIKELY, _LIKELIER = 1e-3, 30.0
 # Two poses are the same minimum if their rotations differ by less than this number of radians, and if the mean point
 # moves by less than this share of its distance from the camera.
 _SAME = 0.035
-# A mirror image is refined if most inliers have a residual there below this number times the spread of their pixels.
+# A mirror image is refined if its residuals of most inliers are below this number times the spread of their pixels.
 _NEAR_MIRROR = 0.2
 # Rival with a larger noise: least standard deviation in radians, first entry of `Evidence.grid` with such a noise,
 # largest loss of log-likelihood per vote, and largest share of inliers of a pose that has such a rival.
 _WIDE_ANGLE, _WIDE_FROM, _GAP, _CLEAR = 6.4e-3, 4, 0.4, 0.9
 # The caller's rival: divisor of the initial variance, least angle from the pose in radians, and largest share of
-# inliers of a pose that is compared with the rival.
+# inliers of a pose that has such a rival.
 _SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.02, 0.97
 # Number of iterations of a rival with constant noise, number of further iterations, and number of iterations from each
 # start in `find_alternatives`.
@@ -155,7 +155,7 @@ def reconsider(
     for i in range(_FROZEN + _FREE):
         tried = refine.by_residuals(every, tried, every.votes.known | (i < _FROZEN), step, damping)
     of_ends = every.evidence_at(tried.state)
-    # The shape is (5, B). The first index is the kind of the rival; index 0 is the refined pose.
+    # These tensors have the shape (5, B). The first index is the kind of the rival, or 0 for the refined pose.
     kind = kind + 1
     likelihood = found.likelihood.new_full((len(kinds) + 1, len(valid)), -torch.inf)
     end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()
@@ -190,7 +190,7 @@ def _moved(points: Tensor, pose: Pose) -> Tensor:
 
 
 def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
-    """Apply a half turn about the normal of the points' plane, the pose, and a half turn about the line of sight."""
+    """Apply a half turn about the normal of the points, then the pose, then a half turn about the line of sight."""
     middle = _mean(problem.world_points, shares)
     centred = problem.world_points - middle[:, None]
     covariance = torch.bmm(centred.mT, shares[..., None] * centred)

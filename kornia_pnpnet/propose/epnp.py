@@ -163,7 +163,7 @@ class EPnP(Initialiser):
         return Starts(Pose(rotation, translation), torch.ones_like(problem.weights), ok)
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
-        """Depths (4, 1, B) of the best case, and whether this case is valid (B,). If not, all points have one depth."""
+        """Depths (4, 1, B) of the best case, and whether it is valid (B,). If invalid, all points have equal depths."""
         cases = _four_cases(system).detach()  # `no_grad` does not stop forward-mode derivatives
         # A shape and its mirror image along the optical axis have the same distances. Gauss-Newton cannot move
         # from one shape to the other shape, and therefore starts from both shapes.
@@ -276,7 +276,7 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 
 
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
-    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem. Minima that are not isolated get 0.
+    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem, and 0 to minima that are not isolated.
 
     Two Newton steps with a constant matrix make first and second derivatives exact. The values do not change.
     """
@@ -306,7 +306,7 @@ def _frames(one: Tensor, two: Tensor) -> Tensor:
 def _best_case(system: _DepthSystem, cases: Tensor) -> Tensor:
     """Index (B,) of the case with the least weighted sum of squared reprojection errors.
 
-    The frames of the first two control vectors give an approximate rotation. This is faster than Procrustes.
+    The frames of the first two control vectors give an approximate rotation. Procrustes would take longer.
     """
     camera, world = _in_camera(system, cases), system.vectors[:, :, None]  # (3, 4, C, B), (3, 3, 1, B)
     camera_frames, world_frame = _frames(camera[:, 1], camera[:, 2]), _frames(world[:, 0], world[:, 1])

@@ -88,7 +88,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """The real root ``u : v`` of a cubic form (4, C) that is farthest from the other two roots.
 
-    When two solutions of a P3P problem nearly coincide, two roots also do. The third root gives a line with both.
+    When two solutions of a P3P problem nearly coincide, two roots also do. The third root gives a line through both.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -226,7 +226,7 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 
 
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Unit vectors along base and height of a triangle, 1 / base, the component of the side along the base, and height².
+    """Unit vectors along base and height of a triangle, 1 / base, the side's component along the base, and height².
 
     The triangle is given by its base and another side, both (3, *, C).
     """
@@ -397,7 +397,7 @@ class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
     If the focal length is unknown, :func:`p3p` solves each sample at every focal length of a grid with constant ratios
-    (see :class:`~kornia_pnpnet.refine.terms.CameraTerm`). Values between those of the grid are left to the refinement.
+    (see :class:`~kornia_pnpnet.refine.terms.CameraTerm`). The refinement finds values between those of the grid.
 
     Example:
         >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))

@@ -60,7 +60,7 @@ class _Branches(NamedTuple):
         return cls(ahead, 1.0 + gain, offset - ahead * ray, change - gain * ray, sq_side)
 
     def interval(self) -> tuple[Tensor, Tensor]:
-        """Least and largest distance of pair 1 with real solutions. Without real solutions, the least distance is larger."""
+        """Least and largest distance of pair 1 with real solutions. Without any, the least distance is larger."""
         sq_tilt = self.tilt.square().sum(0).clamp(min=torch.finfo(self.tilt.dtype).eps ** 2)  # for parallel rays
         middle = -(self.aside * self.tilt).sum(0) / sq_tilt
         sq_half = middle.square() + (self.sq_side - self.aside.square().sum(0)) / sq_tilt

@@ -26,8 +26,8 @@ __all__ = ["REPPnP"]
 
 # Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
-# Outlier rejection keeps at least this number of pairs. A null vector needs 6 pairs, a rigid motion needs 3 pairs. One
-# or two further pairs are kept.
+# Outlier rejection keeps at least this number of pairs: one more than the 6 pairs that determine a null vector, or two
+# more than the 3 pairs that determine a rigid motion.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
 # A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4

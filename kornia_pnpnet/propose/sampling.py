@@ -108,7 +108,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
 
 
 class Samples:
-    """The samples that RANSAC tries: all subsets of pairs, shuffled, or ``most`` random samples of more subsets.
+    """The samples that RANSAC tries: all subsets of pairs in random order, or ``most`` random samples if more exist.
 
     Args:
         chances: relative chances that pairs are drawn, (B, N); 0: never.
@@ -138,7 +138,7 @@ class Samples:
         self._upper = self._share.gather(1, self._order).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        """Positions (P, H, s) of the pairs in samples ``start`` to ``stop - 1`` of problems (P,). Samples may repeat."""
+        """Positions (P, H, s) of pairs in samples ``start`` to ``stop - 1`` of problems (P,). Samples may repeat."""
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
         if self._numbers is not None:

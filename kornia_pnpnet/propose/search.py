@@ -33,7 +33,7 @@ _DTYPE = torch.float32
 _SAMPLES_AT_ONCE = 8192
 # Number of samples in a round, divided by the number of earlier samples, and largest number of samples in a round.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
-# A round draws all remaining samples if these fill at most the first number of rounds, or are at most the second number.
+# A round draws all remaining samples if they fill at most the first number of rounds, or are at most the second number.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
 # After k samples, the first scoring of a round uses the maximum of the first number and the second number * k^(1/3)
 # pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then
@@ -251,7 +251,7 @@ class Search:
         return total if total - done <= min(most, _LARGEST_ROUND) else done + size
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
-        """Find the best poses (P, 12, K) of the samples ``start`` to ``stop - 1``, and their ascending losses (P, K).
+        """Find the best poses of the samples ``start`` to ``stop - 1``: ascending losses (P, K), and poses (P, 12, K).
 
         If a problem has many pairs, a few pairs score all poses first. More pairs then score the best poses. The number
         of first pairs increases with ``start``, because after many samples without success inliers are rare.

@@ -1,4 +1,4 @@
-"""A network on a set of pairs that estimates poses, weights and noise. Pairs have any number and any order."""
+"""A network on a set of pairs that estimates poses, weights and noise, for any number and any order of the pairs."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _T = TypeVar("_T")
 
 # Number of features of a pair, without confidences and repeats, see `_View`.
 _FEATURES = 14
-# Ridge of the affine camera, relative to the mean square of the world points, so that it is unique for planar points.
+# Ridge, divided by the mean square of the world points. The ridge makes the affine camera of planar points unique.
 _RIDGE = 0.02
 # Features are clipped to this absolute value, so that no pair dominates the network.
 _MOST = 8.0
-# Least confidence, and least distance of a confidence from 1.
+# Confidences are clipped to at least this distance from 0 and from 1.
 _LEAST_CONFIDENCE = 1e-3
 # Logarithm of the noise at the centre of its range. The unit of noise is the spread of the pixels or world points.
 _LOG_NOISE = -5.0
@@ -47,18 +47,18 @@ _ABSENT = -1e9
 # Minimal samples. Each number is the rank of a pair in descending order of likelihood. The first six samples are a
 # Turán system: if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# Each entry is a number of pairs and a factor. Problems with at least this number of pairs have the samples above
-# again, with all ranks multiplied by the factor. These samples help if the likeliest pairs are outliers of one pose.
+# Each entry is a number of pairs and a factor. Problems with at least this number of pairs also have the samples above
+# with all ranks multiplied by the factor. These samples help if the likeliest pairs agree on an incorrect pose.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
 # Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two of them share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
-# This number of the likeliest pairs scores each hypothesis. A squared residual of the second number of variances halves
-# the score of a pair. The third number is the score of a pair of likelihood 0, relative to a pair of likelihood 1.
+# Number of likeliest pairs that score each hypothesis. A squared residual of the second number of variances halves the
+# score of a pair. The third number is the score of a pair of likelihood 0, divided by that of a pair of likelihood 1.
 _MOST_JUDGES, _JUDGED, _LEAST_VOTE = 32, 50.0, 0.5
 # If the minimal samples have more slots than this number, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
-# Normalised units. Least depth at which the noise of points is converted to pixels.
+# Least depth, in normalised units, at which the noise of points is converted to pixels.
 _LEAST_DEPTH = 0.5
 # Before a search the network sees at most this number of pairs; the search uses all pairs. On real matches and random
 # problems of up to 1000 pairs, 32 to 96 pairs have the same success as all pairs.
@@ -68,12 +68,12 @@ _ENOUGH = 48
 class _View:
     r"""The network's input.
 
-    The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll: the
-    camera is rotated to the mean of the rays, and zoomed so that their spread is 1. The world is rotated to the axes of
-    an affine camera, which ridge regression fits to the pairs.
+    The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll. The
+    camera is rotated to the mean ray, and zoomed so that the spread of the rays is 1. Ridge regression fits an affine
+    camera to the pairs, and the world is rotated to its axes.
 
     Attributes:
-        there: 1 for pairs of normal scale with a weight above 0, and 0 for other pairs, shape :math:`(B, N)`.
+        there: 1 for usual pairs (see ``Problem.usual``) with a weight above 0, else 0, shape :math:`(B, N)`.
         rays: unit rays in the frame of the original camera, shape :math:`(B, N, 3)`.
         log_spread: logarithm of the spread of the rays, shape :math:`(B, 1)`. The spread is the root mean square sine
             of the angles between the rays and the mean ray.
@@ -123,7 +123,7 @@ class _View:
             return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
         known = sigmas.isfinite()
-        # Unknown sigmas are NaN. They are replaced before the division, because `unit` would have the gradient NaN.
+        # Unknown sigmas are NaN. They are replaced before the division, because `unit` would get the gradient NaN.
         relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
         logs = torch.where(known, relative.clamp(min=_LEAST_NOISE).log() - _LOG_NOISE, 0.0)
         return torch.cat((logs, known.to(logs.dtype)), -1)
@@ -137,13 +137,13 @@ def _repeats(problem: Problem) -> Tensor:
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:
-    """The rotation (B, 3, 3) whose first two rows are closest to ``affine`` (B, 2, 3) with the lengths² ``squares``."""
+    """The rotation with first rows closest to ``affine`` (B, 2, 3), whose squared row lengths are ``squares``."""
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
     # The closest orthonormal rows are S^-1/2 times the rows, where S is the Gram matrix of the rows. S^-1/2 is
     # proportional to the adjugate of S + sqrt(det S) I.
     raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
-    first, second = raised.split(1, -1)  # the gradient of `prod` would wait for a GPU
+    first, second = raised.split(1, -1)  # the gradient of `prod` would synchronise a GPU
     root = (first * second - product.square()).clamp(min=1e-12).sqrt()
     diagonal = raised.flip(-1) + root
     u, v = (diagonal[..., None] * affine - product[..., None] * affine.flip(1)).unbind(1)
@@ -176,13 +176,13 @@ def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
 
 
 def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
-    """Variance of the pixels (B, N) from both noises, as if all points had the depth of the world's centre."""
+    """Variance of the pixels (B, N) from the noise of pixels and points, at the depth of the world's centre."""
     depth = pose.translation[:, 2:].clamp(min=_LEAST_DEPTH)
     return noise.img.square() + (focal * noise.world / depth).square()
 
 
 def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
-    """Minimal samples: least numbers of pairs of a problem that uses a sample (S), and ranks of the pairs (3 S)."""
+    """For S minimal samples, the least numbers of pairs of problems that use them, and the 3 S ranks of their pairs."""
     every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if not search_follows:  # a search draws further samples
         every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
@@ -270,7 +270,7 @@ class SetInit(Initialiser):
     poses of the samples. The best pose is a further hypothesis, and has no gradient.
 
     The weight of a pair is the estimated probability that the pair is an inlier. The network also estimates unknown
-    noise. The layers compute in the dtype of the network's weights, all other operations in that of the pairs.
+    noise. The layers compute in the dtype of the network's weights, all other operations in the dtype of the pairs.
 
     Sources: J. Hesch and S. Roumeliotis, "A direct least-squares method for PnP", ICCV 2011 (distances along rays, then
     alignment); W. Sun et al., "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR
@@ -340,8 +340,8 @@ class SetInit(Initialiser):
         Args:
             problem: pairs in any order. The world is centred and scaled.
             search_follows: whether :func:`~kornia_pnpnet.propose.ransac.search_on` follows. The network then sees at
-                most 48 pairs, and solves fewer samples. The agreement of each other pair with the last hypothesis is
-                its weight.
+                most 48 pairs, and solves fewer samples. The weight of a pair that the network does not see is the
+                agreement of the pair with the last hypothesis.
 
         Returns:
             The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
@@ -410,7 +410,7 @@ class SetInit(Initialiser):
         each = enough.shape[0], batch
         entries = entries.unflatten(-1, each).flatten(1, 2)  # (12, H, B)
         valid = (valid & (three[5] > 0).all(0)).unflatten(-1, each)  # (4, S, B)
-        if not search_follows and count >= _SPREADS[0][0]:  # padding does not count as pairs
+        if not search_follows and count >= _SPREADS[0][0]:  # `there` does not count padding
             valid = valid & (there.sum(1) >= enough)
         valid = valid.flatten(0, 1)  # (H, B)
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):

@@ -76,7 +76,7 @@ def _undone(pose: Pose, count: int) -> list[Pose]:
 
 
 def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: bool) -> tuple[Tensor, Tensor]:
-    """The coordinates x and y in a view, from the coordinates in the problem."""
+    """Convert the coordinates x and y in the problem to coordinates in a view."""
     x, y = (y, x) if swap else (x, y)
     return -x if reverse_x else x, -y if reverse_y else y
 

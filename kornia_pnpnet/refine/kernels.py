@@ -1,4 +1,4 @@
-r"""Robust kernels: the weight of a pair as a function of its squared residual. Hyperparameters within bounds.
+r"""Robust kernels, which weight a pair by its squared residual, and hyperparameters that are learned within bounds.
 
 A kernel is a loss :math:`\rho(s)` of the squared residual and its derivative :math:`w(s)`. The residual is in pixels of
 the normalised camera or, if the noise is known, in standard deviations. The *shape* of ``huber``, ``cauchy``,
@@ -20,7 +20,7 @@ from kornia_pnpnet.core.checks import check_numbers, check_whole
 
 __all__ = ["KERNELS", "POWER_FLOOR", "BoundedParameter", "RobustKernel"]
 
-#: Pixels. ``power`` adds the square of this number to squared residuals, so that the weight at 0 is finite.
+#: ``power`` adds the square of this number to squared residuals in either unit. The weight at 0 is therefore finite.
 POWER_FLOOR = 0.1
 # Largest absolute value of a raw parameter. The sigmoid of 1000 rounds to 1 in float64.
 _BOUND = 1e3
@@ -103,7 +103,7 @@ KERNELS: dict[str, RobustKernel] = {
 
 
 class BoundedParameter(nn.Module):
-    """Values that are learned without bounds and used within bounds.
+    """Learned values within bounds.
 
     A sigmoid maps the raw parameter to ``[lower, upper]``, in log space if ``logarithmic``.
 
@@ -112,7 +112,7 @@ class BoundedParameter(nn.Module):
         size: number of entries.
         lower: lower bound.
         upper: upper bound.
-        logarithmic: interpolate between the logarithms of the bounds, which must be positive.
+        logarithmic: interpolate between the logarithms of the bounds. Both bounds must then be positive.
 
     Raises:
         BaseError: when ``lower`` is not less than ``upper``, or ``initial`` is not within the bounds.

@@ -45,12 +45,12 @@ BACKWARDS = ("unroll", "implicit")
 
 _T = TypeVar("_T")
 
-# Focal lengths. Upper bound of a residual in the cost. Points behind the camera have this residual, so that no point in
-# front of the camera costs more than a point behind the camera.
+# Upper bound of a residual in the cost, in focal lengths. Points behind the camera have this residual, so that no point
+# in front of the camera costs more than a point behind the camera.
 _MAX_RESIDUAL = 2.0
-# Units in the last place. With `reject_worse`, a step is rejected only if the cost rises by more than this.
+# With `reject_worse`, a step is rejected only if the cost rises by more than this number of units in the last place.
 _ROUNDING = 100.0
-# Estimated noise of the points is replaced by 0 only if this raises the log-likelihood by more than this number.
+# Estimated noise of the points is replaced by 0 only if the log-likelihood then rises by more than this number.
 _EXPECTED = 2.0
 # Factors of the damping after a rejected and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
@@ -61,13 +61,13 @@ class Plan(NamedTuple):
 
     Attributes:
         problem: the problem with the caller's weights. Its noise is known for every pair or ``None``.
-        prior: weight of each pair without the robust weight, for the cost and the judge: the caller's weight, without
-            iterations by residual times the initialiser's weight.
-        guided: the product of both weights, divided by the largest product.
-        by_residual: the caller's weights divided by their mean; without iterations by residual ``guided``.
+        prior: weight of each pair, in the cost and in ``judge``, before the robust weight. With iterations by residual,
+            the caller's weight, else the product of the caller's and the initialiser's weights.
+        guided: the product of the caller's and the initialiser's weights, divided by the largest product.
+        by_residual: with iterations by residual, the caller's weights over their mean (without zeros), else ``guided``.
         state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second, ….
         world_sigma: the caller's standard deviation of each point, 0 where unknown.
-        votes: votes of the pairs.
+        votes: see :class:`~kornia_pnpnet.judge.evidence.Votes`.
         hyperparameters: step, damping and shape of the kernel of each iteration, scalars.
         starts: number :math:`S` of initial states of each problem.
     """
@@ -88,7 +88,7 @@ class Plan(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What one iteration passes to the next: the states, and whether the last equations could be solved, bool (B,).
+    """The input and result of an iteration: the states, and whether the last equations could be solved, bool (B,).
 
     ``factor`` (B,) multiplies the damping. ``mixture`` is the distribution of the residuals in iterations by residual.
     """
@@ -145,12 +145,12 @@ class RobustWeightedLM(Configured):
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
     pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is in standard deviations.
 
-    *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser, the others the
-    pose of the lowest cost, with the kernel of the last iteration that refined all poses.
+    *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser. The kernel of
+    the last of these iterations then gives the cost of each pose. All other iterations refine the pose of lowest cost.
 
-    *By residual.* The last ``by_residual`` iterations and the choice among several poses ignore the initialiser's
-    weights, because by then the residuals separate inliers from outliers better. In these iterations a mixture of
-    inliers and outliers, which is fitted to the residuals (:mod:`kornia_pnpnet.judge.evidence`), replaces the kernel.
+    *By residual.* If ``by_residual`` is positive, the choice among poses and the last ``by_residual`` iterations ignore
+    the initialiser's weights, because by then the residuals separate inliers from outliers better. In these iterations,
+    a mixture of inliers and outliers (:mod:`kornia_pnpnet.judge.evidence`), fitted to residuals, replaces the kernel.
 
     Args:
         m: number of iterations. With 0, the pose of the lowest cost is judged without refinement.
@@ -163,12 +163,12 @@ class RobustWeightedLM(Configured):
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
         reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. Without
             rejection, iterations from a distant start can diverge.
-        by_residual: number of final iterations that ignore the initialiser's weights, limited to the iterations after
-            the choice among several poses.
+        by_residual: number of final iterations that ignore the initialiser's weights, at most the number of iterations
+            after the choice among several poses.
         learnable: whether the hyperparameters are trained.
         backward: ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the implicit function theorem to
-            the last state, in a memory that does not grow with ``m``. This gradient is exact at a minimum. Step,
-            damping and initial poses have no implicit gradient.
+            the last state, with an amount of memory that does not grow with ``m``. This gradient is exact at a minimum.
+            Step, damping and initial poses have no implicit gradient.
 
     Raises:
         BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
@@ -225,13 +225,13 @@ class RobustWeightedLM(Configured):
         return KERNELS[self.config["kernel"]]
 
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Step, damping and shape of the kernel of each iteration, like a tensor, :math:`(\max(m, 1),)` each."""
+        r"""Step, damping and kernel shape of each iteration, :math:`(\max(m, 1),)` each, with the dtype of ``like``."""
         count = max(self.m, 1)
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
-        """Copy the module with fewer iterations, or with more, which repeat the hyperparameters of the last.
+        """Copy the module with ``m`` iterations. Further iterations repeat the hyperparameters of the last iteration.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
@@ -332,7 +332,7 @@ class RobustWeightedLM(Configured):
         return Progress(state, solved, now.factor, mixture)
 
     def judge(self, plan: Plan, now: Progress, found: Evidence | None = None, odds: Tensor | None = None) -> Refinement:
-        """Run everything after :meth:`iterate`: evidence (unless ``found``), weights, cost and ``ok`` of a state.
+        """Compute weights, cost, ``ok`` and, unless ``found`` is given, the evidence of the states of :meth:`iterate`.
 
         ``odds`` are log-odds of the poses against their rivals, shape :math:`(B,)`; ``None``: no rivals.
         """
@@ -354,7 +354,7 @@ class RobustWeightedLM(Configured):
         return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
-        """Fit a mixture to the residuals. If they are likelier without estimated noise of points, it becomes 0."""
+        """Fit a mixture to the residuals. Estimated noise of points becomes 0 if the residuals are then likelier."""
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
@@ -368,7 +368,7 @@ class RobustWeightedLM(Configured):
         other = (second > first + _EXPECTED).long()
         index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
         noise, mixture = taken((both, found.mixture), index)
-        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # the strides after an iteration: one graph for both
+        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # same strides as after an iteration, to share a graph
         return plan._replace(problem=plan.problem._replace(noise=noise)), now._replace(mixture=mixture)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
@@ -382,7 +382,7 @@ class RobustWeightedLM(Configured):
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
-        # At a minimum, both costs differ by rounding errors. The step is accepted: a rejected step has no gradient.
+        # At a minimum, both costs differ by rounding errors. Accept the step, because a rejected step has no gradient.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
@@ -436,9 +436,9 @@ class RobustWeightedLM(Configured):
         r"""Attach the gradient of the minimiser to a converged state, by the implicit function theorem.
 
         At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
-        Each added Newton step has this gradient and the value 0, with the Gauss-Newton matrix if the Newton matrix is
-        not positive definite. The second step makes second derivatives exact. With covariances the matrix is not
-        exactly symmetric, because they rotate with the pose; the third step removes most of this error.
+        Each added Newton step has this gradient and the value 0. If the Newton matrix is not positive definite, the
+        Gauss-Newton matrix replaces it. The second step makes second derivatives exact. Covariances of points rotate
+        with the pose, so that the Newton matrix is not exactly symmetric. A third step removes most of this error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:

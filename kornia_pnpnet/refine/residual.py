@@ -49,10 +49,10 @@ MIN_DEPTH_RATIO = 1e-3
 # Largest changes in one step: of the logarithm of the focal length, and of a coefficient of radial distortion. The
 # exponential of a larger change could overflow.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
-# Lower bound of 1 + tr(R), the denominator of the tangent vector of a rotation R. It is 0 at a half turn.
+# Lower bound of the denominator 1 + tr(R) of the tangent vector of a rotation R. At a half turn, 1 + tr(R) is 0.
 _LEAST_DENOMINATOR = 1e-4
 
-# The entries of u and v in one column of the Jacobian. An entry that is the same for all pairs is a Python number.
+# The entries for u and v in one column of the Jacobian. An entry that is the same for all pairs is a Python number.
 _Column: TypeAlias = tuple[Any, Any]
 
 
@@ -209,9 +209,9 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
 def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
     """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
 
-    With noise, which must be known for every pair, squared residuals are in variances of their pixel, and the
-    information is the inverse variance of each pixel, (B, N), or its inverse covariance if the noise has covariances.
-    Without noise, squared residuals are in square pixels, and the information is 1, (1, 1).
+    Without noise, squared residuals are in square pixels, and the information is 1, (1, 1). With noise, all sigmas must
+    be known. Squared residuals are then in variances of their pixel, and the information is the inverse variance of
+    each pixel, (B, N), or the inverse covariance if the noise has covariances.
     """
     noise = problem.noise
     if noise is None:
@@ -375,8 +375,8 @@ def lm_step(
         additive: update the rotation vector additively as in the paper, instead of by the retraction.
 
     Returns:
-        The moved state, and whether the equations could be solved, bool, shape :math:`(B,)`. Otherwise the state does
-        not change.
+        The moved state, and whether the equations could be solved, bool, shape :math:`(B,)`. If the equations could not
+        be solved, the state does not change.
     """
     if not additive:
         delta, solved = solve_positive(equations.matrix, equations.gradient, damping)

@@ -22,17 +22,17 @@ from kornia_pnpnet.result import Pose, PosePrior, sound_pose
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# Limit for the eigenvalues of an information matrix, as a share of the largest eigenvalue, or of 1 if the matrix is
-# scaled to a unit diagonal. Smaller eigenvalues count as 0.
+# Eigenvalues of an information matrix count as 0 below this share of the largest eigenvalue or, if the matrix is scaled
+# to a unit diagonal, below this number.
 _KNOWN = 1e-5
-# Squared errors in squared scales of the robust kernel. The weight of larger errors is 0 in float32.
+# Squared errors are clipped at this number of squared scales of the robust kernel. Larger errors have about no weight.
 _LARGEST_RATIO = 100.0
-# Standard deviations. Default scale of the robust kernel.
+# Default scale of the robust kernel, in standard deviations.
 _SCALE = 3.0
 # Prior standard deviation of a coefficient of radial distortion. The prior keeps a coefficient close to 0 if the pairs
 # do not determine the coefficient.
 _RADIAL = 0.15
-# Matrices. Largest batch of one call of cuSOLVER. A call with a hundred thousand matrices fails.
+# Largest number of matrices in one call of cuSOLVER. A call with a hundred thousand matrices fails.
 _MOST_MATRICES = 10_000
 
 
@@ -40,13 +40,13 @@ _MOST_MATRICES = 10_000
 def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
     """Make a prior from a measured direction of gravity, for example from an accelerometer.
 
-    The prior says nothing about heading and position. The rotation of its pose turns ``world_down`` to ``cam_down``
+    The prior has no information on heading and position. The rotation of its pose maps ``world_down`` to ``cam_down``
     with an arbitrary heading. Gradients flow to all arguments.
 
     Args:
         world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`; :math:`B` stands
             for any number of leading dimensions, also for none.
-        cam_down: measured direction of gravity in the camera's axes (+z forward), as ``world_down``.
+        cam_down: measured direction of gravity in the camera's axes (+z forward), of the same shape as ``world_down``.
         sigma: standard deviation of the measured direction about each perpendicular axis in radians, a number or
             :math:`(B,)`.
 
@@ -72,8 +72,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     dtype = common_dtype(tensors)
     a, b = (functional.normalize(x.to(dtype), dim=-1) for x in (world_down, cam_down))
     eye = torch.eye(3, dtype=b.dtype, device=b.device)
-    # The rotation is half a turn about the bisector of both directions. Opposite directions have no bisector. Any
-    # perpendicular axis is used instead.
+    # The rotation is half a turn about the bisector of both directions. Opposite directions have no bisector. The
+    # rotation is then half a turn about a perpendicular axis.
     least = a.detach().abs().argmin(-1, keepdim=True)
     across = torch.linalg.cross(a, torch.zeros_like(a).scatter(-1, least, 1.0))
     opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
@@ -101,7 +101,7 @@ class CameraTerm(NamedTuple):
         expected: the focal length that the caller expects, in pixels, shape :math:`(B,)`.
         information: inverse variance of the logarithm of the focal length, shape :math:`(B,)`; ``None``: there is no
             prior of the camera.
-        width: half the width of the interval around the logarithm of ``focal`` that is searched, shape :math:`(B,)`.
+        width: half the width of the search interval around the logarithm of ``focal``, shape :math:`(B,)`.
         focal: the focal length of the problem in pixels, shape :math:`(B,)`.
     """
 
@@ -156,7 +156,7 @@ class PoseTerm(NamedTuple):
 
     @classmethod
     def of(cls, prior: PosePrior, centroid: Tensor, size: Tensor) -> tuple[PoseTerm, Tensor]:
-        """Express a prior in the frame of a problem, with the ``centroid`` and ``size`` of its ``Frame``.
+        """Express a prior in the frame of a problem. ``centroid`` and ``size`` are those of the problem's ``Frame``.
 
         Also returns whether the prior is usable, bool (B,): all numbers are in range, and the information is positive
         semi-definite. The information of an unusable prior becomes 0.
