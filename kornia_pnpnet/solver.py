@@ -96,8 +96,8 @@ class PnPNet(PretrainedMixin):
             ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``, with a ``RuntimeWarning``
             if the first batches of a training have none. ``"always"``: all valid problems; the gradient of each
-            problem's loss with respect to its normalised inputs then has a norm of at most 10. For the first training
-            of a network, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+            problem's loss with respect to its normalised inputs then has a norm of at most 10. To train a network from
+            random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8: the problem itself and its mirror images, for which a network
             proposes different poses (see :mod:`kornia_pnpnet.propose.views`).
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.

@@ -63,8 +63,8 @@ _ROUNDS, _FINAL_ROUNDS = 4, 2
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
-# Pairs are copies if both pixels and both points are in the same cell of a grid. These are the sizes of a cell in focal lengths
-# and in units of the normalised world.
+# Pairs are copies if both pixels and both points are in the same cell of a grid. The sizes of a cell are in focal
+# lengths and in units of the normalised world.
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Number of poses of a minimal sample.
 _POSES = 4
