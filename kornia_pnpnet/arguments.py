@@ -30,7 +30,7 @@ __all__ = ["checked_inputs", "given_cameras", "in_parts", "restore_leading"]
 
 _T = TypeVar("_T")
 
-# Pairs. `in_parts` keeps at least this number of pairs of each problem, padding included.
+# When `in_parts` removes padding, a problem keeps at least this number of pairs, padding included.
 _LEAST_PAIRS = 16
 
 
@@ -57,8 +57,8 @@ def checked_inputs(
     """Check the arguments of ``PnPNet.forward``, and return the leading dimensions and one batch of one dtype.
 
     Distorted pixels become pixels of pinhole cameras. Bearings become a rig: each pair gets a camera whose optical axis
-    is the pair's bearing. Tensor values are not checked, because reading a value would stall a GPU. ``init_name`` names
-    ``init`` in messages.
+    is the pair's bearing. Tensor values are not checked, because reading a value would stall a GPU. Error messages
+    call ``init`` by the name ``init_name``.
     """
     is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
     if intrinsics is None and is_bearing:
@@ -166,7 +166,7 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, like: Tensor) -> Tensor:
-    """The caller's camera matrices of a rig, scaled to a last entry of 1: one matrix for each problem or each pair."""
+    """The camera matrices that the caller gave for a rig, with a last entry of 1: one per problem or one per pair."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = _cameras(intrinsics, size).to(like.dtype)
@@ -175,7 +175,7 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, l
 
 
 def _cameras(intrinsics: Tensor | PinholeCamera, size: torch.Size) -> Tensor:
-    """Camera matrices. Those of Kornia's cameras, which have one batch dimension, get the leading dimensions."""
+    """Return camera matrices. Matrices of Kornia's cameras (one batch dimension) get the leading dimensions."""
     matrices = camera_matrices(intrinsics)
     one_batch = isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3 and len(matrices) == size.numel()
     return matrices.reshape(*size, 3, 3) if one_batch else matrices
@@ -184,9 +184,9 @@ def _cameras(intrinsics: Tensor | PinholeCamera, size: torch.Size) -> Tensor:
 def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | None, any_number: bool) -> PnPResult:
     """Solve a batch. On a CPU, parts of the batch that fit the caches are solved one after the other.
 
-    A part has at most ``most`` pairs for each CPU thread; no limit with ``None`` or recorded gradients. With
-    ``any_number``, problems are grouped by their number of pairs, so that parts have little padding. Grouping saves a
-    third to half of the time if the numbers of pairs differ strongly. Parts have at least two problems if possible.
+    A part has at most ``most`` pairs for each CPU thread. Parts have no limit if ``most`` is ``None`` or gradients are
+    recorded. If ``solve`` accepts ``any_number`` of pairs, problems are grouped by their number of pairs, so that parts
+    have little padding. Grouping saves a third to half of the time if the numbers differ strongly.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:

@@ -34,9 +34,9 @@ OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
 _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
 _NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
-# Names of the values of `Status`, and last the status of rows that were not solved.
+# Names of the values of `Status`. The last name is the status of rows that were not solved.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
-# Pairs. Only problems with at least this number of pairs are padded, see `_groups`.
+# Only problems with at least this number of pairs are padded, see `_groups`.
 _PADDED_FROM = 16
 
 
@@ -72,7 +72,7 @@ class Solve:
         ([7, 8], [True, True])
     """
 
-    #: Pairs, padding included. A call of the solver gets at most about this number, to limit the memory.
+    #: A call of the solver gets at most about this number of pairs, padding included, to limit the memory.
     pairs_at_once = 2**17
 
     def __init__(
@@ -85,7 +85,7 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve a table; ``ValueCheckError`` for a missing column, ``TypeCheckError`` for one without numbers."""
+        """Solve a table; ``ValueCheckError`` for a missing column, ``TypeCheckError`` for a column without numbers."""
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"no {name}")
@@ -129,7 +129,7 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """A column of lists ``values[starts[i] : starts[i] + sizes[i]]``. Missing numbers are NaN, missing lists empty."""
+    """A column of lists ``values[starts[i] : starts[i] + sizes[i]]``. Null numbers are NaN, null lists are empty."""
 
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
         array = column.combine_chunks()
@@ -159,7 +159,7 @@ class _Cells:
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
     """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
 
-    The numbers are those below 16, and 16, 20, 24, 28, 32, 40, 48, ..., which add at most a quarter.
+    Problems with at least 16 pairs are padded to 16, 20, 24, 28, 32, 40, 48, ... pairs, by at most a quarter.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

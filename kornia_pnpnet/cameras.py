@@ -1,4 +1,8 @@
-"""Undistorted pixels and bearings of distorted pixels, cameras that look along bearings, and reprojections."""
+"""Undistort pixels, convert pixels to bearings, make cameras that look along bearings, and project points.
+
+The *undistorted point* of a fisheye's pixel has the direction (x, y) of the pixel's ray. The length of the point is the
+angle between the ray and the optical axis, because the plane z = 1 has no point at 90 degrees.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +41,11 @@ __all__ = [
 
 # Numbers of distortion coefficients that Kornia and OpenCV accept.
 _COEFFICIENTS = (4, 5, 8, 12, 14)
-# Newton steps from the distorted to the undistorted point.
+# Number of Newton steps from the distorted to the undistorted point.
 _STEPS = 12
-# Square roots of the machine epsilon. Newton solutions with a larger residual on the plane z = 1 are rejected.
+# Newton solutions are rejected if their relative residual exceeds this number times the root of the machine epsilon.
 _LARGEST_RESIDUAL = 0.1
-# Radians (85 degrees). Fisheye pixels at a larger angle from the axis are not undistorted.
+# Largest angle from the optical axis, in radians, at which fisheye pixels are undistorted (85 degrees).
 _WIDEST = 1.4835
 
 
@@ -50,9 +54,8 @@ def undistort(
 ) -> tuple[Tensor, Tensor, Noise | None]:
     r"""Replace pixels of a camera with distortion by pixels of the pinhole camera with the same intrinsics.
 
-    Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse.
-    Kornia's :func:`kornia.geometry.calibration.undistort_points` does not test convergence, and accepts pixels outside
-    the range of the polynomial.
+    Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse. Unlike
+    this function, :func:`kornia.geometry.calibration.undistort_points` does not reject pixels without a solution.
 
     Args:
         img_points: shape :math:`(B, N, 2)`.
@@ -63,9 +66,9 @@ def undistort(
 
     Returns:
         The undistorted pixels; whether each pixel could be undistorted, bool :math:`(B, N)`; and the noise of the
-        undistorted pixels. A pixel outside the range of the polynomial or more than 85 degrees off the axis of a
-        fisheye, and an invalid pixel, camera or coefficient, give the principal point. Isotropic noise is multiplied by
-        the root mean square of the singular values of the undistortion's Jacobian, so that it stays isotropic.
+        undistorted pixels. A pixel cannot be undistorted if it is outside the range of the polynomial, if it is more
+        than 85 degrees off the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point
+        replaces such a pixel. The factor of isotropic noise is the root mean square of the Jacobian's singular values.
     """
     check_form(["B", "N", "2"], img_points=img_points)
     camera, _ = pinholes(intrinsics)
@@ -82,7 +85,7 @@ def undistort(
             jacobian = torch.where(found[..., None, None], jacobian, eye)
         to_pixels = camera[:, None, :2, :2]
         jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
-        # Numbers that are not finite, such as an unknown sigma, stay. They do not affect the gradient of the camera.
+        # Noise that is not finite, for example an unknown sigma, stays, and does not affect the camera's gradient.
         factor, finite = (0.5 * jacobian.square().sum((-1, -2))).sqrt(), noise.img.isfinite()
         noise = noise._replace(img=torch.where(finite, torch.where(finite, noise.img, 0.0) * factor, noise.img))
         if noise.img_cov is not None:
@@ -97,9 +100,9 @@ def undistort(
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
     """Replace distorted pixels by pixels of pinhole cameras, see :func:`undistort`.
 
-    Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay: ``Normalize`` refuses their problem.
+    Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay, so that ``Normalize`` refuses them.
     """
-    # Rounding depends on the memory layout.
+    # Results must not depend on the memory layout of the inputs, but rounding does.
     inputs, dist, fisheye = map_tensors(torch.Tensor.contiguous, (inputs, dist, fisheye))
     broken = ~inputs.img_points.isfinite().all(-1)
     seen = torch.where(broken[..., None], 0.0, inputs.img_points)
@@ -160,7 +163,7 @@ def bearings(
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
-    """Raise unless at most one of both is a tensor, and its number of coefficients is that of a lens model."""
+    """Raise when both arguments are given, or when a number of coefficients belongs to no lens model."""
     check_tensors({"dist": dist, "fisheye": fisheye})
     if dist is not None and fisheye is not None:
         raise ValueCheckError("Give dist or fisheye, not both.")
@@ -173,8 +176,8 @@ def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     r"""Rotations (B, N, 3, 3) that map directions (B, N, 3) to the z axis, and which directions are valid, bool (B, N).
 
-    An invalid direction, which is not finite or shorter than the square root of the least normal number, gets a
-    constant rotation.
+    A direction is invalid if it is not finite, or if no entry exceeds the square root of the least normal number. An
+    invalid direction gets a constant rotation.
 
     Example:
         >>> rotation, _ = bearing_cameras(torch.tensor([[[3.0, 0.0, -4.0]]]))
@@ -183,7 +186,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_form(["*", "3"], rays=rays)
     rays = rays.to(common_dtype({"rays": rays}))
-    largest = rays.detach().abs().amax(-1, keepdim=True)  # squares of other units could overflow or underflow
+    largest = rays.detach().abs().amax(-1, keepdim=True)  # in this unit, squares cannot overflow
     # The gradient of a shorter direction would overflow.
     sound = (largest > torch.finfo(rays.dtype).tiny ** 0.5) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
@@ -198,7 +201,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
 
 def looking_along(inputs: Inputs) -> Inputs:
     """Convert bearings to a rig: each pair has a camera whose optical axis is its bearing."""
-    inputs = map_tensors(torch.Tensor.contiguous, inputs)  # rounding depends on the memory layout
+    inputs = map_tensors(torch.Tensor.contiguous, inputs)  # see `with_undistorted`
     rotation, sound = bearing_cameras(inputs.img_points)
     rig = inputs.rig
     if rig is not None:  # a pair with an invalid camera becomes a pair without a direction
@@ -251,10 +254,7 @@ def _through(
 
 
 def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor], Tensor]:
-    """Make the function that maps undistorted points (B, N, 2) to distorted points, both on the plane z = 1.
-
-    The length of an undistorted point of a fisheye is its angle, because the plane has no point at 90 degrees.
-    """
+    """Make the function that maps undistorted points (B, N, 2) to distorted points on the plane z = 1."""
     if coefficients is None:
         return lambda point: point
     if not is_fisheye:
@@ -269,20 +269,20 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
 
 
 def _angle(point: Tensor) -> Tensor:
-    """Lengths (B, N, 1) of points, at least the machine epsilon, so that derivatives at the centre are finite."""
+    """Angles (B, N, 1) of a fisheye's undistorted points, bounded below, so that derivatives at 0 are finite."""
     return point.square().sum(-1, keepdim=True).clamp(min=torch.finfo(point.dtype).eps ** 2).sqrt()
 
 
 def _flatten(point: Tensor) -> Tensor:
-    """Project undistorted points of a fisheye (see :func:`_lens`) onto the plane z = 1."""
+    """Project undistorted points of a fisheye onto the plane z = 1."""
     angle = _angle(point)
     return torch.sinc(angle / torch.pi) / angle.cos() * point
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target`` (no solution: 0), and tell which targets have a solution."""
-    # A Newton step is at most half as long as the target is far from the centre. Two further steps carry the gradients
-    # to the target and the coefficients; the second step makes second derivatives exact.
+    """Find points (B, N, 2) that a lens maps to ``target``, else 0, and tell which targets have a solution."""
+    # The longest Newton step is half the distance of the target from the centre. The two steps after the loop carry
+    # gradients to the target and the coefficients. The second of them makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)
@@ -292,7 +292,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
             point = point + (step * (longest / step.norm(dim=-1, keepdim=True).clamp(min=longest))).nan_to_num(0.0)
         seen, jacobian = _linearised(lens, point)
         limit = _LARGEST_RESIDUAL * torch.finfo(point.dtype).eps ** 0.5 * (1.0 + target.norm(dim=-1))
-        # Beyond its maximum the polynomial has further solutions, where the Jacobian mirrors or rotates the image.
+        # Beyond its maximum the polynomial has incorrect solutions. Their Jacobian mirrors or rotates the image.
         ahead = (torch.linalg.det(jacobian) > 0) & (jacobian.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
         found = ((target - seen).norm(dim=-1) < limit) & ahead
         point = torch.where(found[..., None], point, 0.0)

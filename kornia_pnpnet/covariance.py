@@ -24,10 +24,10 @@ __all__ = ["pose_covariance", "shown_noise"]
 # Least eigenvalue of a regular information matrix with a unit diagonal. Smaller eigenvalues are rounding errors of
 # float64.
 _LEAST_EIGENVALUE = 1e-13
-# Largest ratio of an estimated focal length to the focal length that the pixels show. A larger ratio is no estimate,
-# but the initial value of the solver's call.
+# Largest ratio of the given focal length to the focal length that the pixels show at the pose. With a larger ratio,
+# the caller gave the intrinsics of the solver's call in place of the estimate.
 _FOCAL_RATIO = 1.5
-# Shares of the mean variance of a pixel that come from its own noise. The noise of its point causes the rest.
+# `shown_noise` tries these shares of the pixels' own noise in the mean variance. Noise of the points is the rest.
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
@@ -55,8 +55,8 @@ def pose_covariance(
     computation runs in float64. Gradients flow to all arguments.
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
-    least squares on the inliers (P. Huber, "Robust Statistics", 1981). The mean weight of an inlier is therefore
-    :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and :math:`w_i = \min(1, u_i / \bar u)`.
+    least squares on the inliers (P. Huber, "Robust Statistics", 1981). The weights are therefore divided by their mean
+    over the inliers, :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and bounded: :math:`w_i = \min(1, u_i / \bar u)`.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -78,8 +78,8 @@ def pose_covariance(
         Shape :math:`(B, 6, 6)` in radians and the unit of the world. The dtype is the dtype of a solver's result. With
         an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the logarithm of
         the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is
-        infinite and all other entries are 0. The same holds if ``focal`` is ``"unknown"`` and the focal length of the
-        intrinsics is wrong by a factor of 1.5: at the pose, the pixels then show another focal length.
+        infinite and all other entries are 0. The same holds if ``focal`` is ``"unknown"`` and the given focal length
+        differs by more than a factor of 1.5 from the focal length that the pixels show at the pose.
 
     Raises:
         BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` has another value,
@@ -163,8 +163,8 @@ def shown_noise(
 ) -> dict[str, Tensor]:
     """Estimate the noise of pixels and points from the residuals at a pose.
 
-    The noise of a point moves its pixel by an amount that falls with the depth. The likeliest of five ratios between
-    the noise of the points and the noise of the pixels is chosen, for residuals with a normal distribution.
+    The noise of a point moves its pixel less if the depth is larger. The noise of a pixel does not depend on the depth.
+    Of five ratios of both kinds of noise, the ratio with the largest likelihood for Gaussian residuals is chosen.
 
     For the arguments see :func:`pose_covariance`. Returns its ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
     """
@@ -174,7 +174,7 @@ def shown_noise(
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
-    # Variances of the pixels, if the standard deviation of the points is 1; then divided by their mean.
+    # Variances of the pixels if only the points have noise, with the standard deviation 1.
     of_points = pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
     mean = (weights * of_points).sum(1) / total
     share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)

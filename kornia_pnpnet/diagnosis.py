@@ -1,4 +1,4 @@
-"""Find the wrong convention that keeps the pairs of a problem from agreeing with a pose."""
+"""Find the wrong convention of pairs that do not agree with the expected pose, or with any pose."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["Diagnosis", "Trial", "diagnose"]
 
-# Trials whose evidence per pair differs by less than that of 1 px and 1.28 px of noise are equally good.
+# Trials are equally good if their evidence per pair differs by less than this number (noise of 1 px and of 1.28 px).
 _EQUAL = 0.5
 
 
 class Trial(NamedTuple):
-    """How well the pairs agree with the best pose after one change of the input; of a batch, the medians."""
+    """Agreement of the pairs with the best pose after one change of the input. Numbers are medians of the batch."""
 
-    change: str  #: The change.
+    change: str  #: The change in words.
     evidence: float  #: Evidence for the pose, see :mod:`kornia_pnpnet.judge.evidence`, divided by the number of pairs.
     agree: float  #: Share of the pairs that are inliers.
-    sigma: float  #: Standard deviation of a pixel coordinate that the inliers show, in pixels.
+    sigma: float  #: Standard deviation of a pixel coordinate, estimated from the inliers, in pixels.
     ok: bool  #: Whether the pose is believed.
 
 
@@ -38,7 +38,7 @@ class Diagnosis(NamedTuple):
     """The result of :func:`diagnose`. Its ``str`` is one sentence."""
 
     trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
-    #: The trials that make the pairs agree, equally well; only one if no change, or one of the pose, suffices.
+    #: The trials that are ``ok`` and equally good; a single trial if no change, or a change of the pose, suffices.
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:
@@ -59,12 +59,12 @@ class Diagnosis(NamedTuple):
 def diagnose(
     world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, *, pose: Pose | None = None
 ) -> Diagnosis:
-    """Try the usual mistakes in conventions, and tell which of them makes the pairs agree.
+    """Undo the usual mistakes in conventions, and tell which change makes the pairs agree with a pose.
 
     The mistakes are swapped pixel coordinates, a y axis that points up, a left-handed world, an incorrect principal
     point or focal length, the intrinsics of a resized image, normalised coordinates in place of pixels, and a
-    camera-to-world pose. The solver ``pnpnet-set`` solves the input after each change, and the judge of all solvers
-    compares the poses. Points of a plane cannot show a mirrored world, swapped coordinates or a flipped axis.
+    camera-to-world pose. The solver ``pnpnet-set`` solves the input after each change, and the evidence for the poses
+    is compared. Points of a plane cannot show a mirrored world, swapped coordinates or a flipped axis.
 
     Args:
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. All problems of a batch must
@@ -93,7 +93,7 @@ def diagnose(
     names, batch = [*changed], tuple(torch.cat(x) for x in zip(*changed.values(), strict=True))
     if inputs.init is not None:
         names = [names[0], "invert the pose", "find another pose", *names[1:]]
-    for effort in ("fixed", "adaptive"):  # the search for the last pose takes long and is mostly not needed
+    for effort in ("fixed", "adaptive"):  # the adaptive search takes long and is rarely needed
         with world_points.device:
             solver = create_solver("pnpnet-set", effort=effort)
         pairs, poses = batch, solver(batch[0], batch[1], batch[2]).pose
@@ -122,12 +122,12 @@ def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[T
     ok = frame.valid & believe(seen, problem, found, unknown)[1]
     sigma = found.sigma * problem.focal / frame.img_scale
     columns = found.log_ratio / problem.weights.shape[1], found.inlier.gt(0.5).to(sigma).mean(1), sigma, ok.to(sigma)
-    rows = torch.stack(columns, -1).unflatten(0, (len(names), -1)).median(1).values.tolist()  # of all problems
+    rows = torch.stack(columns, -1).unflatten(0, (len(names), -1)).median(1).values.tolist()  # of the batch
     return tuple(Trial(name, a, b, c, believed > 0) for name, (a, b, c, believed) in zip(names, rows, strict=True))
 
 
 def _changed(world: Tensor, pixels: Tensor, cameras: Tensor) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-    """Points (B, N, 3), pixels (B, N, 2) and cameras (B, 3, 3) after each change, for each mistake without a pose."""
+    """Points (B, N, 3), pixels (B, N, 2) and cameras (B, 3, 3) after each change that does not concern the pose."""
     centre, upright = cameras[:, None, :2, 2], pixels.new_tensor([1.0, -1.0])
 
     def camera(focal: float, principal: float) -> Tensor:

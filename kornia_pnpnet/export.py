@@ -166,7 +166,7 @@ def _reason(error: Exception) -> str:
 
 
 def check_packages(suffix: str) -> None:
-    """Raise ``ImportError`` when the extra ``onnx`` or, for ``.pt2``, a C++ compiler is not installed."""
+    """Raise ``ImportError`` when the extra ``onnx`` (for ``.onnx``) or a C++ compiler (for ``.pt2``) is missing."""
     if suffix == ".onnx":
         with needs("onnx", "ONNX models need more packages"):
             for name in ("onnx", "onnx_ir", "onnxscript"):
@@ -193,13 +193,13 @@ def export_package(
 ) -> Path:
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
-    :func:`load_package` loads the package without tracing or compiling; C++ programs load it with libtorch alone. A
+    :func:`load_package` loads the package without tracing or compiling. C++ programs need only libtorch to load it. A
     package runs on one thread. It needs the PyTorch version of the compiling program, and a CPU with the instruction
     sets (for example AVX-512) of the compiling CPU. Compiling takes minutes. An existing file is replaced when the
     package is complete.
 
     A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
-    packages. With PyTorch's own loader, each call of such a package in a thread overwrites the previous result.
+    packages. With PyTorch's own loader, a call of such a package overwrites the previous result of the same thread.
 
     ``n`` may also be several numbers of pairs, such as ``(16, 64, 256)``. The file then holds a model for each number,
     and a problem is padded to the next number. C++ programs choose a model by its name: "n16" is the model for 16
@@ -290,7 +290,7 @@ class PackagedSolver:
         inputs = [world_points, img_points, intrinsics, weights, *(cam_from_rig or ())]
         check_shapes(dict(zip(RIG_INPUTS, zip(inputs, shapes, strict=False), strict=False)))
         inputs = [x.to("cpu", torch.float32) for x in inputs]
-        if n < size:  # padding: the last pair again, with a weight of 0
+        if n < size:  # the padding repeats the last pair, with weight 0
             pair = torch.arange(size).clamp(max=n - 1)
             inputs = [x if i == 2 and not self.rig else x.index_select(1, pair) for i, x in enumerate(inputs)]
             inputs[3][:, n:] = 0.0
@@ -324,10 +324,10 @@ def load_package(path: str | Path) -> PackagedSolver:
 def export_onnx(
     solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
 ) -> Path:
-    """Write a solver as an ONNX model in one file, which ONNX Runtime runs without PyTorch, and return the path.
+    """Write a solver to one file as an ONNX model, for ONNX Runtime without PyTorch, and return the path.
 
-    See :func:`export_program` for the arguments, inputs, outputs and errors. ``ImportError``: the extra ``onnx`` is not
-    installed. An existing file is replaced when the model is complete.
+    See :func:`export_program` for the arguments, inputs, outputs and errors. Without the extra ``onnx``, the function
+    raises ``ImportError``. An existing file is replaced when the model is complete.
     """
     check_packages(".onnx")
     path = Path(path)

@@ -19,16 +19,16 @@ from kornia_pnpnet.result import Pose, Status, sound_pose
 
 __all__ = ["F_CONST", "Frame", "Normalize", "scaled_cameras"]
 
-#: Pixels. Focal length of the normalised camera (cameras of ETH3D have focal lengths of 3400 to 3430).
+#: Focal length of the normalised camera in pixels. (Cameras of ETH3D have focal lengths of 3400 to 3430.)
 F_CONST = 3400.0
-# Limit of the entries of given poses. Their fourth powers must be finite in float32, the dtype of the networks.
+# Limit of the entries of given poses. Fourth powers of entries must be finite in float32, the dtype of the networks.
 _LARGEST_ENTRY = torch.finfo(torch.float32).max ** 0.25
-# Typical distances (see `Normalize`) from the median. Centre and scale ignore points beyond `_FAR`, or `_FAR_OF_FEW`
-# with fewer than `_MANY` pairs, because the typical distance of few points is inaccurate.
+# Centre and scale ignore points more than `_FAR` typical distances (see `Normalize`) from the median. With fewer than
+# `_MANY` pairs, the limit is `_FAR_OF_FEW`, because the typical distance of few points is inaccurate.
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
-# Typical distances from the median. Points further away lose their weight, because float32 has too few digits.
+# Points beyond this number of typical distances from the median lose their weight, because float32 has too few digits.
 _LARGEST_DISTANCE = 1e6
-# Confidences outside of [0, 1] by less than this number are rounded probabilities, such as cosines of descriptors.
+# A confidence (such as a cosine of descriptors) may leave [0, 1] by less than this number, because of rounding.
 _ROUNDING = 1e-3
 # Tangent of 85 degrees. No real lens without distortion shows larger angles from the axis.
 _FAR_ANGLE = 11.4
@@ -40,14 +40,14 @@ class Frame(NamedTuple):
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
-        img_scale: factor of pixels: the geometric mean of the absolute factors of u and v, in a rig the mean over the
-            pairs, shape :math:`(B,)`.
+        img_scale: pixels of the problem per pixel of the caller: the geometric mean of the absolute factors of u and v,
+            in a rig the mean over the pairs, shape :math:`(B,)`.
         order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
             :math:`(B, N, 3, 3)`. The identity replaces invalid matrices.
         ignored: ``Status.CONFIDENCE`` or ``Status.INIT`` if the confidence of a pair or the initial pose was invalid
-            and ignored, else ``Status.SOLVED``, int64, shape :math:`(B,)`; ``None``: the caller gave neither.
+            and ignored, else ``Status.SOLVED``, int64, shape :math:`(B,)`; ``None``: the caller gave no such argument.
     """
 
     centroid: Tensor
@@ -91,7 +91,7 @@ class Frame(NamedTuple):
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
 
     def start(self, init: Pose | None) -> tuple[Pose, Tensor]:
-        """Express the caller's pose, else the identity, in this frame, and tell which poses are finite, bool (B,)."""
+        """Express the caller's pose, or the identity, in this frame, and tell which poses are usable, bool (B,)."""
         eye = torch.eye(3, dtype=self.size.dtype, device=self.size.device).expand(self.size.shape[0], 3, 3)
         init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
         values = torch.cat((init.rotation.flatten(1), self.apply(init).translation), 1).detach()
@@ -113,7 +113,7 @@ class Normalize(Configured):
     the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
     five typical distances from the median of the points (25 with fewer than 12 pairs). The typical distance is the
     radius around the median that contains two thirds of the points. A pair loses its weight if its point is more than a
-    million typical distances from the median, or its pixel almost 90° off the axis.
+    million typical distances from the median, or if its pixel is almost 90° off the axis.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -164,7 +164,7 @@ class Normalize(Configured):
             intrinsics: shape :math:`(B, 3, 3)`; in a rig one matrix for each pair, :math:`(B, N, 3, 3)`.
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
-            noise: in pixels and in the unit of the world.
+            noise: noise of each pair, in pixels and in the unit of the world.
             confidence: see :class:`~kornia_pnpnet.problem.Problem`. Pairs with a value outside of [0, 1] are left out.
             rig: see :class:`~kornia_pnpnet.problem.Problem`.
         """
@@ -191,7 +191,7 @@ class Normalize(Configured):
         cameras, is_camera = scaled_cameras(cameras.contiguous())
         camera = cameras[:, None] if intrinsics.ndim == 3 else cameras  # (9, 1 or N, B)
 
-        # Fourth powers of numbers between `limit` and its inverse neither overflow nor underflow. NaN compares false.
+        # Fourth powers of numbers between `limit` and its inverse neither overflow nor underflow. NaN fails each test.
         limits = torch.finfo(rows.dtype)
         limit = limits.max**0.25
         given = rows[5] != 0
@@ -218,7 +218,7 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, typical.new_full((), _FAR_OF_FEW), _FAR) * typical
         seen = there & (off_axis <= self.f_const * _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # keep wide angles of few pairs
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # few pairs keep wide angles
         is_usual = usual.to(rows.dtype)
 
         # Compute centre and scale from the usual points. Squares are in units of the largest coordinate.
@@ -243,7 +243,7 @@ class Normalize(Configured):
             rig = sound_pose(rig, sound)
         status = torch.where(spread_out, Status.PRECISION.value, Status.DEGENERATE.value)
         status = status.masked_fill(is_precise, Status.SOLVED.value)
-        status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # no camera, or not the pixels' camera
+        status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # invalid, or not the pixels' camera
         if padded:
             status = status.masked_fill(given.sum(0) < MIN_PAIRS, Status.TOO_FEW_PAIRS.value)
         ignored = None
@@ -274,7 +274,7 @@ class Normalize(Configured):
         if noise is not None:
 
             def scaled(sigma: Tensor, unit: Tensor) -> Tensor:
-                """Replace unknown and impossible sigmas first, so that the gradient of the unit is not NaN."""
+                """Divide sigmas. Unknown sigmas are replaced first, so that the gradient of the unit is not NaN."""
                 known = has_noise[:, None] & ~sigma.isnan()
                 return torch.where(known, torch.where(known, sigma, 0.0) / unit, torch.nan)
 
@@ -300,15 +300,15 @@ class Normalize(Configured):
 
 
 def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid. Others become the identity.
+    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid.
 
     A valid matrix has zeros below its diagonal and focal lengths that are not 0. The fourth powers of its entries and
-    of the inverses of its focal lengths and of its last entry are finite.
+    of the inverses of its focal lengths and of its last entry are finite. The identity replaces an invalid matrix.
     """
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
     scaled = entries / entries[8:]
-    # The sum of absolute values bounds each value. NaN compares false.
+    # The sum of absolute values bounds each value. NaN is not below the limit.
     largest = torch.cat((entries, entries[8:].reciprocal(), scaled, scaled[:5:4].reciprocal())).abs().sum(0)
     below_diagonal = torch.cat((entries[3:4], entries[6:8])).any(0)
     fine = (largest < limit) & ~below_diagonal

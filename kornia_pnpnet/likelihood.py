@@ -26,15 +26,15 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["monte_carlo_pose_loss"]
 
-# Degrees of freedom of the t distributions, whose heavy tails let no importance weight become very large.
+# Degrees of freedom of the t distributions. The heavy tails prevent very large importance weights.
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Radians. Largest scale of a t distribution's rotation. Tangent vectors approximate larger rotations badly.
+# Largest scale of a t distribution's rotation, in radians. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth, as a share of the distance of the points. A smaller depth is raised; the difference is a residual.
+# Least depth, as a share of the distance of the points. A smaller depth is raised, and adds to the squared residual.
 _LEAST_DEPTH = 0.02
 
 
@@ -59,18 +59,18 @@ def monte_carlo_pose_loss(
 ) -> Tensor:
     r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
 
-    The likelihood compares the true pose with all others. It has useful gradients from the first step of a training,
-    when no pose fits the correspondences. The density of a pose :math:`y` is :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`.
-    The cost :math:`c` is half the weighted sum of the robust losses of the residuals in standard deviations. If the
-    world points have noise, the cost includes the logarithm of the variance. In the prior :math:`p_0`, rotations are
-    uniform, and translations have a t distribution around the true translation, whose scale is half the distance
-    between camera and points. :math:`Z` is an integral over all poses, estimated by importance sampling.
+    The likelihood compares the true pose with all other poses. The loss has useful gradients from the first step of a
+    training, when no pose fits the correspondences. The density of a pose :math:`y` is
+    :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted sum of the robust losses of the
+    residuals in standard deviations. If the world points have noise, the cost includes the logarithm of the variance.
+    In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the true translation
+    with half the distance between camera and points as its scale. Importance sampling estimates the constant :math:`Z`.
 
-    The same number of samples is drawn from each component of a mixture: the prior, a t distribution around the true
-    pose, one around each hypothesis, and ``rounds`` further ones. The centre of a further one is a mode: the refined
+    The same number of samples is drawn from each component of a mixture. The components are the prior and t
+    distributions around the true pose, around each hypothesis, and around ``rounds`` modes. A mode is the refined
     sample with the largest importance weight so far. The precision of a t distribution is the matrix of the normal
-    equations at its centre. Gradients flow to all inputs but poses. A problem that a solver would refuse has the loss 0
-    without gradient.
+    equations at its centre. Gradients flow to all inputs except poses. A problem that a solver would refuse has the
+    loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
     4 to 7; here with hypotheses and a prior, and with modes in place of fitted proposals.
@@ -83,7 +83,7 @@ def monte_carlo_pose_loss(
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
         mask: see ``PnPNet.forward``.
-        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network can learn to predict it.
+        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network can learn to predict ``img_sigma``.
         world_sigma: see ``PnPNet.forward``. World points are exact without ``world_sigma`` and ``world_cov``.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
@@ -130,7 +130,7 @@ def monte_carlo_pose_loss(
         )
         for name, pose in (("truth", truth), *(("hypotheses", pose) for pose in others))
     ]
-    # One pose in float64 is enough for float64.
+    # The loss is computed in float64 if at least one pose is in float64.
     size, inputs = max(checked, key=lambda x: x[1].world_points.dtype.itemsize)
     noise = inputs.noise
     assert noise is not None

@@ -28,7 +28,7 @@ __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
 # Least probability in the cross entropy, so that the loss of a single pair is bounded.
 _LEAST_PROBABILITY = 1e-3
-# Variances. Squared residuals are clipped to this value, because larger residuals are not noise.
+# Squared residuals in variances are clipped to this value, because larger residuals are not noise.
 _MOST_VARIANCES = 20.0
 
 
@@ -89,10 +89,10 @@ def _centre(problems: Problems) -> Tensor:
 class PoseLoss(nn.Module):
     r"""Weighted sum of the rotation and translation distances of the first guess and of the refined pose.
 
-    The refined translation is compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`, and
-    that of the first guess at the centroid of the points, because at a far origin it would repeat the rotation error.
-    The error of a failed refinement has no bound. The weighted refined distance :math:`d` of a problem is therefore
-    saturated to :math:`d / (1 + d / c)`.
+    Refined translations are compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`.
+    Translations of the first guess are compared at the centroid of the points, because an error at a distant origin
+    repeats the rotation error. The error of a failed refinement has no bound. The weighted refined distance :math:`d`
+    of a problem is therefore saturated to :math:`d / (1 + d / c)`.
 
     Args:
         rotation: weight of the chordal rotation distances.
@@ -148,17 +148,17 @@ class PoseLoss(nn.Module):
 class SetLoss(nn.Module):
     r"""The loss of a set network, which trains poses, inlier probabilities and noise.
 
-    Translations are compared at the centroid of the points, relative to its distance from the camera. The terms are:
+    Translations are compared at the centroid of the points, in units of the centroid's distance. The terms are:
 
     - First guess: a weighted mean of the best hypothesis's distance and the mean distance of all hypotheses. The best
-      one has most of the weight, so that hypotheses can differ.
+      hypothesis has most of the weight, so that hypotheses can differ.
     - Refined pose: both distances, each divided by its limit of success, saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
     - Negative log-likelihood of the estimated noise, given the inliers' residuals at the true pose.
 
     Args:
         starts: number of the network's hypotheses, which are the first poses of the starts.
-        every: weight of the mean over the hypotheses. The best one has the weight ``1 - every``.
+        every: weight of the mean over the hypotheses. The best hypothesis has the weight ``1 - every``.
         refined: weight of the refined term, for ``ramp=1``.
         saturation: :math:`c` of :class:`PoseLoss`, as a multiple of the limits of success.
         weights: weight of the cross entropy.

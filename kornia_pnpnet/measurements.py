@@ -26,7 +26,7 @@ from kornia_pnpnet.result import Pose, camera_matrices, check_pose, sound_pose, 
 
 __all__ = ["depth_points", "heatmap_keypoints"]
 
-# Squared cells: the variance of a uniform distribution over one cell, per axis.
+# Variance of a uniform distribution over one cell, per axis, in squared cells.
 _CELL_VARIANCE = 1.0 / 12.0
 
 
@@ -34,11 +34,11 @@ _CELL_VARIANCE = 1.0 / 12.0
 def heatmap_keypoints(
     heatmaps: Tensor, temperature: Tensor | float = 1.0, *, stride: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    r"""Keypoints and their covariances from heat maps: the mean and the covariance of the softmax of each map.
+    r"""Compute keypoints and their covariances, the mean and the covariance of the softmax of each heat map.
 
     The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance is
-    that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), and thus positive
-    definite. A loss such as :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` trains it.
+    the covariance of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), and thus
+    positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
@@ -104,7 +104,7 @@ def depth_points(
     img_sigma: Tensor | float | None = None,
     img_cov: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    r"""World points and their covariances from pixels with depth, for example from keypoints of an RGB-D image.
+    r"""Compute world points and their covariances from pixels with depth, for example in an RGB-D image.
 
     A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
     :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is

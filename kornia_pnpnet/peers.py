@@ -103,8 +103,8 @@ class PeerSolver(nn.Module):
         Returns:
             The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. The dtype is
             float64 if an input is float64, else float32. A weight is 1 if the library reports the pair as an inlier,
-            else 0. The cost in px² is the mean squared reprojection error of the pairs that the library gets, each at
-            most the squared threshold.
+            else 0. The cost is the mean squared reprojection error in px² of the pairs that the library gets. Errors
+            above the threshold are truncated to the threshold.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
         check_form(["*", "N", "2"], img_points=img_points)  # no bearings
@@ -115,7 +115,7 @@ class PeerSolver(nn.Module):
         used = present & (shares > 0)
         cameras, pinhole = pinholes(cameras)
         pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)  # no peer supports skew
-        # Not every peer supports a negative focal length, so that peers get the reflected image.
+        # An image with a negative focal length is reflected, because not every peer supports such a camera.
         signs = cameras.diagonal(dim1=1, dim2=2).sign()
         img, cameras = img * signs[:, None, :2], signs[..., None] * cameras
         sound = world.isfinite().all(-1) & img.isfinite().all(-1) & shares.isfinite() & (shares >= 0) | ~present
@@ -198,7 +198,7 @@ class _OpenCV(PeerSolver):
     def flag(self) -> int:
         """Return OpenCV's constant for the method."""
         cv2, name = self.library(), self.kind + f"{self.method}".removeprefix(self.kind)
-        usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"  # which is for fundamental matrices
+        usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"  # for fundamental matrices
         KORNIA_CHECK(usable, f"OpenCV {cv2.__version__} has no method {self.method} for poses.")
         return int(getattr(cv2, name))
 
@@ -234,7 +234,7 @@ class OpenCVPnP(_OpenCV):
 class OpenCVRansac(_OpenCV, RobustPeer):
     r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on the inliers, problem by problem.
 
-    The defaults were tuned on problems of the protocol, where noise of a close world point moves its pixel by 17 px.
+    The defaults were tuned on ``SyntheticProblems``, where noise of a close world point moves its pixel by 17 px.
     World points with less noise need a lower threshold. With noisy world points, ``method="SQPNP", refine=False``
     solves more problems and takes several times as long, because SQPnP minimises an error in space.
 
@@ -278,7 +278,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
 
 @dataclass(eq=False, kw_only=True)
 class OpenCVUsac(OpenCVRansac):
-    r"""A USAC variant of OpenCV's ``solvePnPRansac``, which refines its pose itself; see :class:`OpenCVRansac`.
+    r"""A USAC variant of OpenCV's ``solvePnPRansac``, with its own refinement. See :class:`OpenCVRansac`.
 
     Args:
         method: OpenCV's name of the variant. ``USAC_PROSAC`` expects the pairs sorted from the best to the worst.
@@ -294,8 +294,8 @@ class OpenCVUsac(OpenCVRansac):
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
 
-    kornia-rs computes in float32. Local optimisation is no option, because it solves no more of the protocol's
-    problems. For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
+    kornia-rs computes in float32. Its local optimisation is off, because it does not solve more of the
+    ``SyntheticProblems``. For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
 
     Args:
         max_iterations: largest number of RANSAC iterations.
@@ -330,7 +330,7 @@ class PoseLib(RobustPeer):
     For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
 
     Args:
-        min_iterations: smallest number of RANSAC iterations. PoseLib's own 1000 solve no more problems of nine pairs.
+        min_iterations: smallest number of RANSAC iterations. PoseLib's default, 1000, is not better for 9 pairs.
         max_iterations: largest number of RANSAC iterations. A problem without a pose takes this number of iterations.
         progressive_sampling: use PROSAC, which needs pairs that are sorted from the best to the worst.
     """
@@ -369,7 +369,7 @@ class PyColmap(RobustPeer):
 
     Args:
         loss_scale: scale of the Cauchy loss of the refinement in pixels, tuned like ``threshold``. COLMAP's own default
-            of 1 px suits world points with little noise; with the protocol's it solves several per cent fewer problems.
+            of 1 px suits world points with little noise, but solves several per cent fewer ``SyntheticProblems``.
         min_iterations: smallest number of RANSAC iterations.
         max_iterations: largest number of RANSAC iterations.
     """

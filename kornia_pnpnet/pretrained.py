@@ -27,9 +27,9 @@ WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 # Key of the digest in the metadata of the weights file.
 _FINGERPRINT = "sha256"
-# Bytes. Upper limit of the part of a configuration file that is read. Every valid file is smaller.
+# Largest number of bytes that are read from a configuration file. Every valid file is smaller.
 _LARGEST_CONFIG = 2**20
-# Integers up to this value are accepted in every configuration: tensors of such sizes take little memory.
+# Integers up to this value are accepted in every configuration, because tensors of such sizes take little memory.
 _SMALL = 1000
 
 
@@ -39,7 +39,7 @@ def shipped_weights() -> list[str]:
 
 
 def write_weights(folder: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
-    """Write constructor arguments to ``config.json``, and named tensors to ``model.safetensors``, to a folder."""
+    """Write constructor arguments to ``config.json`` and named tensors to ``model.safetensors`` in a folder."""
     from safetensors.torch import save
 
     state = {name: value.detach().cpu().contiguous() for name, value in state.items()}
@@ -168,7 +168,7 @@ class PretrainedMixin(nn.Module):
         """Write ``config.json`` and ``model.safetensors`` to a folder. A missing folder is created.
 
         Raises:
-            ValueCheckError: when the initialiser is not one that :meth:`from_pretrained` can build.
+            ValueCheckError: when :meth:`from_pretrained` cannot build the initialiser.
         """
         config = self.config()
         if self.init is not None and config["init"]["name"] not in _INITIALISERS:
@@ -177,7 +177,7 @@ class PretrainedMixin(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name_or_folder: str | Path) -> Self:
-        """Load a trained solver, in evaluation mode, whose parameters require gradients.
+        """Load a trained solver in evaluation mode. Its parameters require gradients.
 
         The solver can be trained further after ``solver.train()``. For inference alone, use ``torch.no_grad()`` or
         ``solver.requires_grad_(False)``, or :func:`~kornia_pnpnet.create_solver` for shipped solvers.

@@ -18,9 +18,9 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Inputs", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
 
-#: Focal lengths. Least standard deviation of a pixel, so that the weights of exact pixels are finite.
+#: Least standard deviation of a pixel in focal lengths, so that the weights of exact pixels are finite.
 LEAST_NOISE = 1e-6
-#: Pairs. Least number of pairs that determine a pose up to a few solutions.
+#: Least number of pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
 
 
@@ -43,7 +43,7 @@ class State(NamedTuple):
 
     @property
     def zoom(self) -> Tensor:
-        """Logarithm of the focal length divided by ``Problem.focal``, :math:`(B, 1)`; :math:`(B, 0)` if it is known."""
+        """Logarithm of focal length over ``Problem.focal``, :math:`(B, 1)`; :math:`(B, 0)` for known focal lengths."""
         return self.camera[:, :1]
 
     @property
@@ -57,7 +57,7 @@ class Noise(NamedTuple):
 
     Attributes:
         img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``,
-            the sigma of isotropic noise with the same trace, for networks, which ignore ``img_cov``.
+            the sigma of isotropic noise with the same trace, because networks ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, each entry of shape :math:`(B, N)`. ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.
@@ -88,10 +88,10 @@ class Inputs(NamedTuple):
 
     Attributes:
         intrinsics: in a rig, a camera matrix for each pair, :math:`(B, N, 3, 3)`.
-        noise: if given, every pair has sigmas, NaN where unknown.
+        noise: noise of every pair, NaN where unknown; ``None``: the caller gave no noise.
         rig: the transform from the rig to the camera of each pair.
         free_focal: range and prior of an unknown focal length in the caller's pixels, see :class:`Problem`.
-        radial: estimated coefficients of radial distortion, which has been removed from the pixels.
+        radial: coefficients of the radial distortion that ``with_found_focal`` estimated and removed from the pixels.
     """
 
     world_points: Tensor
@@ -135,7 +135,7 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty of poses in the choice of the best start, of which the scale is the penalty 1 of an outlier pair.
+        """Penalty for poses that differ from the prior, added to losses in the search. An outlier has the loss 1.
 
         The batch of the poses, for example :math:`(H, B)` or :math:`(P, H)`, broadcasts with the batch of the term.
         """
@@ -149,7 +149,7 @@ class Problem(NamedTuple):
         img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
             shape :math:`(B, N, 2)`.
         weights: weight of each pair, at least 0; 0 for padding, shape :math:`(B, N)`.
-        focal: the focal length in pixels that all pairs share, a scalar.
+        focal: the focal length in pixels that all pairs share, a scalar; its initial value if it is unknown.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
         usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), else 0, shape :math:`(B, N)`.
@@ -158,8 +158,8 @@ class Problem(NamedTuple):
         rig: the transform from the rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose
             of the problem is then the pose of the rig. ``None``: one camera.
         pose_terms: priors of the pose, such as :class:`~kornia_pnpnet.refine.terms.PoseTerm`.
-        free_focal: range and prior of an unknown focal length, a :class:`~kornia_pnpnet.refine.terms.CameraTerm`;
-            ``None``: the focal length is ``focal``.
+        free_focal: range and prior of an unknown focal length, a :class:`~kornia_pnpnet.refine.terms.CameraTerm`.
+            ``None``: the focal length is known.
     """
 
     world_points: Tensor
@@ -177,7 +177,7 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, world_points: Tensor, img_points: Tensor, focal: Tensor | float = 1.0, **more: Any) -> Problem:
-        """A problem without normalisation. Weights and scales are 1 unless given in ``more``."""
+        """A problem without normalisation. Weights, ``usual`` and scales are 1 unless given in ``more``."""
         one = torch.ones_like(world_points[..., 0])
         scale = one.new_ones(one.shape[0])
         given = {"weights": one, "usual": one, "img_scale": scale, "world_scale": scale, **more}
@@ -185,18 +185,18 @@ class Problem(NamedTuple):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The priors of the pose and of the camera."""
+        """The priors of pose and camera, which the refinement adds to its loss."""
         return self.pose_terms + self.camera_terms
 
     @property
     def camera_terms(self) -> tuple[Term, ...]:
-        """The prior of the camera. An unknown focal length without ``focal_sigma`` has no prior."""
+        """The prior of the camera, if the focal length is unknown, and ``focal_sigma`` or ``radial`` is given."""
         known = self.free_focal is not None and self.free_focal.information is not None
         return (self.free_focal,) if known else ()
 
     @property
     def usual_weights(self) -> Tensor:
-        """The weights, 0 for pairs that are not usual, for initialisers that are not robust, :math:`(B, N)`."""
+        """Weights for initialisers that are not robust, 0 for pairs that are not usual, shape :math:`(B, N)`."""
         return self.weights * self.usual
 
     @property
@@ -205,7 +205,7 @@ class Problem(NamedTuple):
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
     def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays (B, N, 3) in the rig's frame through points on the planes z = 1. The rays have the length ``focal``."""
+        """Rays (B, N, 3) of length ``focal`` in the rig's frame, through points on the planes z = 1 of the cameras."""
         assert self.rig is not None
         rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
         rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
@@ -213,7 +213,7 @@ class Problem(NamedTuple):
 
     def seen_with(self, zoom: Tensor) -> Problem:
         """The same pairs with the known focal length ``focal * exp(zoom)``. ``zoom`` has the shape (B, 1) or (B, 0)."""
-        # All problems share `focal`: pixels and their noise are divided by the exponential.
+        # All problems share `focal`. Pixels and their noise are therefore divided by the exponential.
         if not zoom.shape[1]:
             return self
         factor = (-zoom).exp()
@@ -237,8 +237,8 @@ class Starts(NamedTuple):
         weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
         ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: all true.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
-        noise: noise of each pair in the units of the problem, without covariances: the caller's, where unknown the
-            initialiser's estimate. ``None``: the initialiser does not estimate noise.
+        noise: noise of each pair in the units of the problem, without covariances. The initialiser estimates what the
+            caller did not give. ``None``: the initialiser does not estimate noise.
         camera: initial camera parameters for all poses, see :class:`State`; ``None``: zeros.
     """
 
@@ -267,7 +267,7 @@ class Hypotheses(NamedTuple):
 
     Attributes:
         pose: rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)` in the frame of the sample.
-        valid: which slots hold a solution, bool, shape :math:`(B, S)`. Other slots have finite values.
+        valid: which slots hold a solution, bool, shape :math:`(B, S)`. Empty slots have finite values.
     """
 
     pose: Pose

@@ -30,12 +30,12 @@ _Peer: TypeAlias = Literal[
 ]
 # Iterations of the classical robust LM: `_FEW` from another method's pose, `_MANY` from the identity.
 _FEW, _MANY = 10, 30
-# Pairs in a sample of the paper's RANSAC.
+# Number of pairs in a sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
 
 
 def _trained(weights: str, m: int | None = None) -> PnPNet:
-    """A solver with ``m`` iterations (0: the network alone, the paper's "Net")."""
+    """A trained solver with ``m`` iterations. With 0, the network is used alone (the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
     return solver if m is None else solver.with_options(refine=solver.refine.with_iterations(m))
 
@@ -52,7 +52,7 @@ def _paper_lm(m: int) -> RobustWeightedLM:
 
 
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
-    """The paper's "-LM": the classical robust LM refines the pose of another method."""
+    """A solver that refines another method's pose by the classical robust LM (the paper's "-LM")."""
     return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
 
 

@@ -269,7 +269,7 @@ class Alternatives(NamedTuple):
     Attributes:
         rotation: world-to-camera rotations by descending probability, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
-        cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. The costs are comparable.
+        cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. Costs of one problem are comparable.
         probability: probability of each pose, given that the true pose is among the alternatives and the result's pose,
             shape :math:`(B, S)`.
         valid: which slots hold a pose, bool, shape :math:`(B, S)`. Empty slots come last.
@@ -315,8 +315,8 @@ class PnPResult(NamedTuple):
             :math:`(B, N, 3, 3)`. The estimate replaces an unknown focal length. For one camera, the identity replaces
             an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
-        sigma: standard deviation of a pixel coordinate that the inliers show, in the caller's pixels, shape
-            :math:`(B,)`, without gradient. Noise of the points is included at the usual depth.
+        sigma: standard deviation of a pixel coordinate, estimated from the inliers, in the caller's pixels, shape
+            :math:`(B,)`, without gradient. The estimate includes noise of the points at the usual depth.
         inliers: which pairs are inliers of the pose, bool, shape :math:`(B, N)`.
     """
 
@@ -335,7 +335,7 @@ class PnPResult(NamedTuple):
     inliers: Tensor = _UNSET
 
     def __repr__(self) -> str:
-        """Five lines: the number of problems that are ok, medians and ranges of what the solver knows, and the pose."""
+        """Five lines: the number of ``ok`` problems, median and range of inliers, sigma and probability, the pose."""
         shown = self.ok, self.status, self.inliers, self.sigma, self.probability, *self.pose
         if not all(type(x) is Tensor and sees_values(x) and x.numel() for x in shown):
             return tuple.__repr__(self)
@@ -382,8 +382,8 @@ class PnPResult(NamedTuple):
                 result replace them.
             noise: further arguments of ``pose_covariance``. The default weights are ``inliers``. Without noise, the
                 noise is estimated from the residuals of the inliers (see
-                :func:`~kornia_pnpnet.covariance.shown_noise`). With noise of the points only, ``sigma`` is the noise of
-                the pixels.
+                :func:`~kornia_pnpnet.covariance.shown_noise`). If only noise of the points is given, ``sigma`` is the
+                noise of the pixels.
 
         Returns:
             Shape :math:`(B, 6, 6)`, see ``pose_covariance``.
@@ -413,7 +413,7 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose, in a rig the pose of the rig.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate; ``None``: unknown, also below.
+        img_sigma: standard deviation of the noise on each pixel coordinate; ``None``: unknown, also in later fields.
         world_sigma: standard deviation of the noise on each world coordinate.
         confidence: belief that a pair is an inlier.
         img_cov: covariance of the noise of each pixel, in place of ``img_sigma``.

@@ -40,8 +40,8 @@ __all__ = ["PnPNet"]
 
 # Largest norm of the gradient of a problem's loss with respect to normalised inputs. Usual norms are about 1.
 _LONGEST_GRADIENT = 10.0
-# Additional iterations from a nominal focal length: with 1000 pairs, fewer do not converge (CameraProblems, seeds 4321,
-# 4322). Radial distortion gets its gradient from these iterations, because the search has no gradient.
+# Number of additional iterations from a nominal focal length. With 1000 pairs, fewer do not converge (CameraProblems,
+# seeds 4321, 4322). Radial distortion gets its gradient from these iterations, because the search has no gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -69,7 +69,7 @@ class PnPNet(PretrainedMixin):
     The layer normalises the correspondences, lets ``init`` propose poses, refines and judges the poses, and expresses
     the best pose in the frame of the inputs. All steps are batched and differentiable. An unsolvable problem gets
     ``ok=False``, a ``status`` with the reason (see :class:`~kornia_pnpnet.result.Status`), and a finite pose without
-    gradient. Other problems of the batch do not change.
+    gradient, and does not affect other problems.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``. All
     multiples of a camera matrix are the same camera. Focal lengths may be negative, for example ``fy`` in an image with
@@ -97,14 +97,14 @@ class PnPNet(PretrainedMixin):
         gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``, with a ``RuntimeWarning``
             if the first batches of a training have none. ``"always"``: all valid problems; the gradient of each
             problem's loss with respect to its normalised inputs then has a norm of at most 10. To train a network from
-            nothing, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+            random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8: the problem itself and its mirror images, for which a network
             proposes different poses (see :mod:`kornia_pnpnet.propose.views`).
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
             focal length. With ``SetInit`` the refinement starts from a nominal focal length. If the result is not
             believed, or with another initialiser, a search with P3P finds an initial focal length. A problem is not
-            ``ok`` when the pairs leave the focal length open.
+            ``ok`` when the standard deviation of the logarithm of the focal length exceeds 0.15.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
         radial: number of coefficients of radial distortion that are estimated with an unknown focal length, 0 to 2. The
@@ -300,8 +300,8 @@ class PnPNet(PretrainedMixin):
         """Compile the solver in place with ``torch.compile``: the first stage, an iteration, and the final stage.
 
         The first call compiles for some seconds. A new number of pairs, a new dtype, or gradients cause a new
-        compilation, another size of the batch does not. Parts that cannot be compiled (RANSAC, or all parts without a
-        C++ compiler) run uncompiled after one warning. A copy of the solver compiles again.
+        compilation. A new batch size does not. Parts that cannot be compiled (RANSAC, or all parts without a C++
+        compiler) run uncompiled after one warning. A copy of the solver compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
@@ -321,8 +321,8 @@ class PnPNet(PretrainedMixin):
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma, self.radial)
-        # A network's poses fit the nominal focal length. A caller's pose does not. After a search for doubted problems,
-        # their refinement goes on by residual.
+        # A network's poses fit the nominal focal length. A caller's pose does not. After `find_focal` has replaced a
+        # doubted pose, the refinement continues by residual.
         given = inputs.init is not None or inputs.prior is not None
         free = trait(self.init, "estimates_noise") and self.refine.by_residual and not given
         if free and not self.radial:

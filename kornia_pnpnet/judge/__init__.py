@@ -1,1 +1,1 @@
-"""Judge a pose: ``inliers`` finds its inliers by thresholds, ``evidence`` tells whether it is to be believed."""
+"""Judge a pose: ``inliers`` finds its inliers by thresholds, and ``evidence`` decides whether the pose is believed."""

@@ -7,12 +7,12 @@ ratio
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
-leaves out its three largest terms, because some pose fits any three pairs. Copies of a pair share one vote :math:`v_i`.
-Expectation and maximisation estimate :math:`w`. If the noise is unknown, :math:`s` is a grid of angles; if the caller
-gave the noise, :math:`s` is 1 or, with a low prior probability, larger.
+leaves out its three largest terms, because some pose fits any three pairs. The votes :math:`v_i` of all copies of a
+pair have the sum 1. Expectation and maximisation estimate :math:`w`. If the noise is unknown, :math:`s` takes the
+values of a grid. If the caller gave the noise, :math:`s` is 1 or, with a lower prior probability, a power of 8.
 
 The *evidence* is the logarithm of the mean of :math:`\exp L(s)`, minus the logarithms of the number of minimal samples
-and of the number of poses per sample. A pose is to be *believed* if the evidence suffices and the inliers determine the
+and of the number of poses per sample. A pose is *believed* if the evidence suffices and the inliers determine the
 pose accurately.
 
 The results have no gradient.
@@ -54,7 +54,7 @@ __all__ = [
 # Unknown noise: the smallest standard deviation of the grid in radians, the ratio of neighbouring variances, and the
 # number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
 _LEAST_ANGLE, _STEP, _SCALES = 1e-4, 8.0, 6
-# Given noise: the factors of the variance are powers of 8. Prior log-probability of each power.
+# Given noise: `s = 8^k` has the prior log-probability k times this number.
 _UNEXPECTED = -3.0
 # Rounds of expectation and maximisation: for the share of inliers at each factor, and for the final factor and share.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
@@ -63,8 +63,8 @@ _ROUNDS, _FINAL_ROUNDS = 4, 2
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
-# Pairs are copies if both pixels and both points are in the same cell of a grid. Size of a cell in focal lengths, and
-# in units of the normalised world.
+# Pairs are copies if both pixels and both points are in the same cell of a grid. The sizes of a cell are in focal
+# lengths and in units of the normalised world.
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Number of poses of a minimal sample.
 _POSES = 4
@@ -80,14 +80,14 @@ LAW = (-1.573, 0.6221, -0.4594)
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: of the rotation in radians, and of the translation as a share of the distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
-# Largest `pose_sigma` of a pose that is believed. Two standard deviations are the largest error of a correct pose.
+# Largest `pose_sigma` of a pose that is believed. Twice this value is the largest error of a correct pose.
 _OPEN = 0.5
-# Radians. Largest standard deviation of plausible noise. With 0.0125, 4 % of the correct poses of indoor RGB-D matches
+# Largest standard deviation of plausible noise in radians. With 0.0125, 4 % of correct poses of indoor RGB-D matches
 # (`rgbd/indoor.npz`, without a ratio test) would not be believed.
 _MOST_NOISE = 0.016
 # A point lies off a line if its distance exceeds this factor times the standard deviation of the points along the line.
 _OFF = 0.05
-# With this number of inliers, one point off the line suffices. Each further inlier requires a further point, up to 3.
+# The required number of points off the line is the number of inliers minus this number, at least 1, at most 3.
 _FEW = 5
 # Rounds of the robust fit of the line, and squarings of the covariance for its first eigenvector.
 _LINE_ROUNDS, _SQUARINGS = 3, 3
@@ -98,9 +98,9 @@ class Votes(NamedTuple):
 
     Attributes:
         pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
-        known: whether the caller gave the noise of a problem, bool (B, 1).
-        outlier: density of an outlier's pixel, divided by the density of a narrow inlier of variance 1 px² at the
-            projection, if half of the pairs are inliers, (B, 1).
+        known: whether the caller gave any noise of the problem, bool (B, 1).
+        outlier: density of an outlier's pixel, divided by the narrow part of an inlier's density at the projection, for
+            a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
     """
 
     pairs: Tensor
@@ -127,9 +127,9 @@ class AtPose(NamedTuple):
 
     Attributes:
         projection: the points projected at the pose.
-        exponent: minus half of the squared residual in variances of its pixel, -∞ in effect behind the camera, (B, N).
-        density: the square root of the determinant of the precision, (B, N) or (1, 1).
-        outlier: ``Votes.outlier`` with the variance of each pixel, (B, N) or (B, 1).
+        exponent: minus half the squared residual in variances of its pixel, about -∞ behind the camera, (B, N).
+        density: the square root of the determinant of ``precision``, (B, N) or (1, 1).
+        outlier: ``Votes.outlier`` divided by ``density``, (B, N) or (B, 1).
         precision: inverse variance of each pixel, (B, N) or (1, 1), or inverse covariance.
     """
 
@@ -151,7 +151,7 @@ class Mixture(NamedTuple):
     Attributes:
         variance: factor of the variances of the inliers, shape (B, 1). If the problem has no noise, the unit is px².
         share: share of inliers, shape (B, 1).
-        least: lower bound of ``variance``, shape (B, 1). Few pairs could otherwise be fitted ever more closely.
+        least: lower bound of ``variance``, shape (B, 1). Otherwise few pairs could make the variance 0.
         total: sum of the votes, shape (B, 1).
     """
 
@@ -161,7 +161,7 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Densities (B, N) of inliers, of inliers divided by their factor of the variance, and of outliers."""
+        """Densities (B, N) of inliers, of inliers divided by the factor of their kind (1 or 9), and of outliers."""
         scaled = exponent / self.variance
         narrow, wide = scaled.exp(), (scaled / _WIDE).exp()
         share = _TAIL / (1.0 - _TAIL) / _WIDE
@@ -182,8 +182,8 @@ class Evidence(NamedTuple):
         grid: :math:`L` plus the prior log-probability of each factor, shape (B, F).
         mixture: the estimated distribution of the residuals.
         inlier: probability that a pair is an inlier, shape (B, N).
-        radian: factor of the variances at which the usual standard deviation is one radian, shape (B, 1).
-        sigma: the standard deviation of a pixel that the inliers show, in radians, shape (B,).
+        radian: factor of the variances at which the geometric mean of the standard deviations is one radian, (B, 1).
+        sigma: the standard deviation of a pixel in radians, estimated from the inliers, shape (B,).
     """
 
     log_ratio: Tensor
@@ -201,7 +201,7 @@ class Evidence(NamedTuple):
 
 @torch.no_grad()
 def copies(rows: Tensor, there: Tensor) -> Tensor:
-    """Number (B, N) of rows that equal each row of (B, N, C), among the rows ``there`` (B, N); at least 1."""
+    """For each row of (B, N, C), the number (B, N) of equal rows among the rows ``there`` (B, N), at least 1."""
     key = _KEY ** torch.arange(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     order = (rows * key).sum(-1).argsort(1)
     ordered = rows.gather(1, order[..., None].expand_as(rows))
@@ -214,7 +214,7 @@ def copies(rows: Tensor, there: Tensor) -> Tensor:
 
 @torch.no_grad()
 def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
-    """Compute the evidence for a pose of a problem, whose noise is known for every pair or ``None``."""
+    """Compute the evidence for a pose. The noise of the problem must be known for every pair, or ``None``."""
     exponent, density, outliers = (x.detach() for x in (seen.exponent, seen.density, seen.outlier))
     there, total = votes.pairs > 0, votes.pairs.sum(-1, keepdim=True).clamp(min=1.0)
     mean = torch.where(there, density.log(), 0.0).sum(-1, keepdim=True) / there.sum(-1, keepdim=True).clamp(min=1)
@@ -260,9 +260,9 @@ def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
 
 @torch.no_grad()
 def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None = None) -> Mixture:
-    """One round of expectation and maximisation. Problems ``frozen``, bool (B, 1), keep their variance.
+    """One round of expectation and maximisation. ``frozen`` problems, bool (B, 1), keep their variance.
 
-    ``None``: the problems with noise from the caller are frozen.
+    ``None``: problems are frozen if the caller gave their noise.
     """
     exponent = seen.exponent.detach()
     inlier, weighted, outlier = mixture.densities(exponent, seen.outlier.detach())
@@ -278,11 +278,11 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 
 @torch.no_grad()
 def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The :func:`probability` of a pose, whether it is to be believed, bool, and its :func:`pose_sigma`, all (B,).
+    """The :func:`probability` of a pose, whether it is believed, bool, and its :func:`pose_sigma`, all (B,).
 
     The probability must be at least `LEAST_PROBABILITY`, and :func:`pose_sigma` must be small. The points of the
-    inliers must span more than a line. The noise must be plausible, or ``known`` (B, 1) from the caller: pairs of a
-    wrong convention, such as mirrored pixels, show much noise at their best pose.
+    inliers must span more than a line. The noise must be plausible, or at most the caller's noise, if ``known`` (B, 1),
+    because pairs of a wrong convention, such as mirrored pixels, show much noise at their best pose.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
@@ -296,7 +296,7 @@ def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> t
 def probability(log_ratio: Tensor, sigma: Tensor) -> Tensor:
     """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    It is a logistic function of the evidence ``log_ratio`` and of the logarithm of :func:`pose_sigma`, both (B,).
+    The probability is a logistic function of the evidence ``log_ratio`` and of log ``sigma`` (see :func:`pose_sigma`).
     """
     evidence, log_sigma = clipped(log_ratio, sigma)
     offset, by_evidence, by_sigma = LAW
@@ -311,7 +311,7 @@ def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
     """Standard deviation of the pose in units of the largest errors of a correct pose, float64, (B,).
 
-    The variances of rotation, translation and an unknown focal length, which changes the distance, are added.
+    The result adds the variances of rotation, translation and an unknown focal length (as a change of the distance).
     ``precision`` is the inverse variance (or covariance) of each pixel in px^-2, (B, N), 0 for outliers. The result is
     infinite for an undetermined pose.
     """
@@ -361,7 +361,7 @@ def _form(matrix: Tensor, vector: Tensor) -> Tensor:
 def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
     """Whether enough points (B, N, 3) of the inliers (B, N) lie off a line, bool (B,).
 
-    A line leaves one rotation free, so that a few outliers can determine a pose by chance.
+    Points on a line leave one rotation free, so that a few outliers can determine this rotation by chance.
     """
     weights = there = inliers.to(world_points.dtype)[..., None]  # (B, N, 1)
     tiny = torch.finfo(weights.dtype).tiny

@@ -70,9 +70,9 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
 
 
 def median_residual(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
-    """Median of the squared residuals (B, N) of the used pairs ``there`` (B, N), infinite without such a pair, (B, 1).
+    """Median (B, 1) of the squared residuals (B, N) of the pairs ``there``, bool (B, N); infinite without a pair.
 
-    A state can fit ``fitted`` pairs exactly, so that the median ignores this number of smallest residuals.
+    The median ignores the ``fitted`` smallest residuals, because a state can fit ``fitted`` pairs exactly.
     """
     count = there.sum(-1, keepdim=True)
     ascending = in_order(torch.where(there, sq_residuals, torch.inf).mT[None])[0].mT
