@@ -311,7 +311,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         multiple of the rounding error of its diagonal entry. Otherwise the solution is 0, and gradients are finite.
     """
     limits = torch.finfo(right.dtype)
-    least = limits.tiny**0.5  # the gradient of an inverse pivot has its square
+    least = limits.tiny**0.5  # the gradient divides by the square of a pivot
     eye = torch.eye(len(right), dtype=right.dtype, device=right.device)
     damped = torch.addcmul(matrix, matrix, eye[..., None] * damping)
     if not are_few(right):

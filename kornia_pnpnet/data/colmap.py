@@ -29,7 +29,7 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
     point twice, the first pixel is used. Points behind the camera are dropped. All pairs of a model count as inliers.
 
     A file of matches is an ``.npz`` file of V images. The file has the arrays ``names`` (V,), ``K`` (V, 3, 3),
-    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2), which is width and height. All other names start with the index
+    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with width and height. All other names start with the index
     of an image in three digits. For example, the M matches of image 7 are ``007_img_points`` (M, 2),
     ``007_world_points`` (M, 3) and ``007_error_px`` (M,). The error is the reprojection error under the true pose.
 

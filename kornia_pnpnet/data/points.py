@@ -53,7 +53,7 @@ _YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
 # Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
 # Depth maps: standard deviation of each coordinate of a map camera about the query camera, relative to the mean
-# distance of the points. The viewing directions of map camera and query camera then differ by 10 to 40 degrees.
+# distance of the points. Map and query camera then see a point from directions that differ by 10 to 40 degrees.
 _BASELINE = 0.3
 # Depth maps: bounds of the change of a flying pixel's distance from its map camera, as a share of the distance.
 _FLIGHT = (-0.3, 0.6)

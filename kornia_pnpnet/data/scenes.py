@@ -76,7 +76,7 @@ class Scene:
     Attributes:
         name: the scene's name.
         views: the images that observe enough points, sorted by name.
-        skipped: names of the images that were left out because they observe too few points.
+        skipped: names of the images that were left out because the images observe too few points.
         metric: whether the unit of the scene is the metre. Otherwise the unit is arbitrary.
     """
 
@@ -96,8 +96,8 @@ class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
     Each problem consists of ``n`` random points of a random image and their pixels. ``outliers`` changes the pixels of
-    some pairs: the pixel of a *mismatch* is the pixel of a spare point of the same image. All other inliers of
-    the image stay inliers. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points and poses
+    some pairs: the pixel of a *mismatch* is the pixel of a spare point of the same image. All other inliers of the
+    image stay inliers. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points and poses
     do not depend on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that

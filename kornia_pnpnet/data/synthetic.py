@@ -36,7 +36,7 @@ _MOST_NOISE = 10.0
 _TINY = 1e-9
 # Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87°.
 _LEAST_COSINE = 0.05
-# Half the side of the largest image without `half_image`, at a focal length of 1. Other points lie outside.
+# Half the side of the largest image without `half_image`, at a focal length of 1. Some points may lie outside.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
 # Number of first pairs of a problem that are never copies. A choice: eight pairs can still determine a pose.
 _LEAST_ORIGINALS = 8
