@@ -56,7 +56,7 @@ def solve_shards(
     as a whole. Its arrays have the same names: ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally
     ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma`` and ``world_sigma`` of (), (B,) or (B, N).
 
-    A results file appears when it is complete. A repeated call skips the shards that have results. Shards that cannot
+    Only complete results files appear. A repeated call skips the shards that have results. Shards that cannot
     be read are reported.
 
     Args:

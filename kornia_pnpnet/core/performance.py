@@ -68,7 +68,7 @@ if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even i
 def in_turn(x: Tensor) -> AbstractContextManager[Any]:
     """Return a context in which threads run one after the other, if ``x`` has few numbers (see :func:`are_few`).
 
-    Without this context, four threads wait for Python's lock at every operation, and take 2.5 times as long as one.
+    Without turns, four threads wait for Python's lock at each operation and take 2.5 times as long as one thread.
     """
     return _TURN[0] if are_few(x) else nullcontext()
 
@@ -128,7 +128,7 @@ def keep_freed_memory() -> None:
 # --- order ------------------------------------------------------------------------------------------------------------
 
 # Largest number of pairs that compiled code sorts by comparisons, which compile to one loop. For 9 pairs in each of
-# 1000 problems, the loop takes 31 µs and `Tensor.sort` takes 65 µs. With two keys, they take 60 and 200 µs.
+# 1000 problems, the loop takes 31 µs and `Tensor.sort` takes 65 µs. With two keys, the times are 60 and 200 µs.
 _FEW_PAIRS = 12
 
 

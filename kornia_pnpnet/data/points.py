@@ -242,7 +242,7 @@ class DepthMaps:
 
     - noise along the ray of the map camera. The standard deviation is :math:`a d^2 / \bar d` at the distance
       :math:`d`, because the noise of stereo and structured light grows with the square of the distance.
-    - the error of the map camera's rotation, which turns all points of one map about this camera;
+    - the error of the map camera's rotation. This error turns all points of one map about the map camera;
     - *flying pixels*: at the edge of an object, the measured distance lies between object and background. These pairs
       are outliers.
 

@@ -92,7 +92,7 @@ class SyntheticProblems(RandomProblems):
         depth_maps: errors of world points that depth cameras have measured, in addition to ``world_sigma``. Known noise
             does not include these errors. ``None`` means no errors of depth cameras.
         copies_share: share of the problems with copies, as from detectors that list a place several times. In these
-            problems, up to half of the pairs are copies of other pairs. The first 8 pairs are no copies.
+            problems, a pair is a copy of another pair with a probability of up to 0.5. The first 8 pairs are no copies.
         dtype: dtype of the batches; numbers are drawn in float64.
         device: device of the batches; numbers are drawn on the CPU.
 
