@@ -33,7 +33,7 @@ def main(config: DictConfig) -> float | None:
     """Train, and write results and weights.
 
     Returns:
-        The success rate on the validation set ``uniform``, or on the last set without a set of this name. A sweeper may
+        The success rate on the validation set ``uniform``, or on the last set if no set has this name. A sweeper may
         maximise this rate.
     """
     runtime = HydraConfig.get()
@@ -89,7 +89,7 @@ def main(config: DictConfig) -> float | None:
         )
     except (TrainingError, OSError) as error:
         if sweeps:
-            raise  # the sweep goes on with its other runs
+            raise  # the sweep continues with its next run
         log.error("%s", error)
         sys.exit(1)
     if not fabric.is_global_zero:
@@ -124,13 +124,13 @@ def main(config: DictConfig) -> float | None:
 
 
 def continuing(*more: str) -> str:
-    """The command that continues this run, or all runs of the sweep. Jobs of a cluster do not know their sweep."""
+    """The command that continues this run, or all runs of the sweep. A cluster's job does not know its command."""
     words = sys.argv if Path(sys.argv[0]).name == Path(__file__).name else ["train.py", "-m", "..."]
     return shlex.join(["python", *words, *(word for word in more if word not in words)])
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:
-    """Copy the weights of another solver. A refinement of another kind keeps its initial hyperparameters."""
+    """Copy the weights of another solver. If the refinements differ in kind, ``model`` keeps its refinement."""
     state = trained.state_dict()
     kind = {key: trained.refine.config[key] for key in ("m", "kernel", "shared", "by_residual")}
     if not kind.items() <= model.refine.config.items():

@@ -1,4 +1,4 @@
-"""The command ``pnpnet``: one module per command, whose docstring is the help, and ``run`` returns the exit code.
+"""The command ``pnpnet``. Each command has a module: its docstring is the help, and ``run`` returns the exit code.
 
 The modules import PyTorch inside ``run``, so that errors in arguments appear at once.
 """

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-# Largest standard deviation of the logarithm of a focal length. With a larger one the focal length is unknown.
+# Largest standard deviation of the logarithm of a focal length. A larger number must be a focal length in pixels.
 _MOST_SIGMA = 3.0
 
 #: Names of synthetic data for ``--data``.
@@ -73,7 +73,7 @@ def _focal(text: str) -> dict[str, Any]:
 
 
 def _path(text: str) -> str:
-    """Return the path of a file or a folder; ``OSError`` when the path does not exist."""
+    """Return the path of a file or a folder. Raise ``OSError`` when the path does not exist."""
     Path(text).stat()
     return text
 
@@ -163,7 +163,7 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def load_solver_without_truth(name: str) -> nn.Module:
-    """Make the solver named by ``--solver``; ``ValueError`` for a bound, because bounds need the true pose."""
+    """Make the solver named by ``--solver``. Raise ``ValueError`` for a bound, because bounds need the true pose."""
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, load_solver
 
     if name.partition(":")[0] in BOUNDS:

@@ -28,7 +28,7 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort the pixels by ``kornia_pnpnet.data.colmap.undistort``; pixels without a ray get the weight 0."""
+        """Undistort the pixels (``kornia_pnpnet.data.colmap.undistort``). Where this is impossible, the weight is 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -51,7 +51,7 @@ def camera_matrix(text: str) -> Tensor:
 
 
 def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
-    """Scale a pinhole camera matrix so that its last element is 1; ``InputError`` for any other matrix."""
+    """Scale a pinhole camera matrix so that its last element is 1. Raise ``InputError`` for any other matrix."""
     if not matrix.isfinite().all():
         raise InputError(source, "the intrinsics are not finite")
     if matrix[1, 0] != 0 or matrix[2, :2].any() or matrix[2, 2] == 0:
@@ -62,9 +62,9 @@ def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
-    """Read a CSV file with the columns ``X,Y,Z,u,v`` and optionally ``weight``, or an NPZ file of the fields' names.
+    """Read CSV with the columns ``X,Y,Z,u,v`` and optionally ``weight``, or NPZ with the names of the result's fields.
 
-    ``InputError`` for fewer than three correspondences, a missing column or array, or an invalid number.
+    Raise ``InputError`` for fewer than three correspondences, a missing column or array, or an invalid number.
     """
     path = Path(path)
     read = _read_npz(path) if path.suffix.lower() == ".npz" or is_zipfile(path) else _read_csv(path)
@@ -114,7 +114,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the arrays with the given names; ``InputError`` if ``world_points`` or ``img_points`` is missing."""
+    """Read the named arrays. Raise ``InputError`` if ``world_points`` or ``img_points`` is missing."""
     try:
         arrays = read_npz(path, names)
     except ValueError as error:

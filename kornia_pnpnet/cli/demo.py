@@ -89,7 +89,7 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
-    """Train briefly and print the success rates of the first and last validation; ``None`` if a package is missing."""
+    """Train and print the success rates of the first and last validation. Return ``None`` if a package is missing."""
     from kornia_pnpnet.core.extras import needs
     from kornia_pnpnet.core.files import read_csv
 

@@ -53,10 +53,10 @@ def solve_shards(
     r"""Solve shards of problems one after the other. The results of the shard ``part.*`` go to ``part.parquet``.
 
     A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. An NPZ shard is read
-    as a whole. It has arrays of the same names, ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally
+    as a whole. Its arrays have the same names: ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally
     ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma`` and ``world_sigma`` of (), (B,) or (B, N).
 
-    A results file appears when it is complete. A repeated call skips the shards that have results. Shards that cannot
+    Only complete results files appear. A repeated call skips the shards that have results. Shards that cannot
     be read are reported.
 
     Args:
@@ -96,7 +96,7 @@ def solve_shards(
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
-    """Find all shards by the stems of their names. Shards of a folder are sorted by name."""
+    """Map the stem of each shard's name to its path. Shards of a folder are sorted by name."""
     shards: dict[str, Path] = {}
     endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):
@@ -157,7 +157,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
     """Yield tables of at most ``batch`` rows from a Parquet file. An empty file yields one empty table."""
     try:
-        # With pre_buffer Arrow would read ahead to the end of the file; without buffer_size, whole row groups.
+        # With pre_buffer, Arrow would read the whole file ahead. Without buffer_size, it would read whole row groups.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
             groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
             numbers = [sum(x.column(i).num_values for i in range(x.num_columns)) // max(x.num_rows, 1) for x in groups]

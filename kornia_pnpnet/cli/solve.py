@@ -42,7 +42,7 @@ _ADVICE = {
     "offset before they become float32",
     "behind": "the points are behind the camera; check the axes: x to the right, y down, z forward",
 }
-# Largest noise and smallest share of inliers that are plausible. Correspondences of a wrong convention exceed them.
+# Largest plausible noise, and smallest plausible share of inliers. Files with a wrong convention violate a limit.
 _MOST_NOISE_PX, _LEAST_SHARE = 10.0, 0.5
 _MISTAKES = (
     "swapped columns, another image size, y up? try --diagnose; many outliers? try --solver p3p-ransac:threshold=PX"
@@ -125,7 +125,7 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     pixels = reproject(world_points, camera, result.pose)[0]
     errors, limit = (pixels - img_points).norm(dim=-1), arguments.threshold
     inliers, sigma = int(result.inliers.sum()), result.sigma.item()
-    rejected = ~(result.inliers[0] if limit is None else errors <= limit) | ~result.ok  # without a pose all pairs
+    rejected = ~(result.inliers[0] if limit is None else errors <= limit) | ~result.ok  # no pose: reject all
     deviations = torch.where(result.ok, covariance[0].diagonal().sqrt(), torch.nan)
     answer = {
         "solver": name,

@@ -22,7 +22,7 @@ def _is_number(value: Any) -> bool:
 
 
 def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
-    """Raise ``BaseError`` unless each value is an integer, also NumPy's, from ``least`` to ``most`` (``None``: any)."""
+    """Raise ``BaseError`` unless each value is an integer (also NumPy's) from ``least`` to ``most``, if given."""
     bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     for name, value in values.items():
         whole = isinstance(value, Integral) and not isinstance(value, bool)
@@ -60,14 +60,14 @@ def check_tensors(tensors: Mapping[str, Any]) -> None:
 
 
 def check_form(form: list[str], **tensors: Tensor) -> None:
-    """Raise an error unless each value is a tensor with the shape ``form`` of ``KORNIA_CHECK_SHAPE``."""
+    """Raise an error unless each value is a tensor of the shape ``form``, as ``KORNIA_CHECK_SHAPE`` defines it."""
     check_tensors(tensors)
     for name, tensor in tensors.items():
         KORNIA_CHECK_SHAPE(tensor, form, f"Argument: {name}")
 
 
 def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
-    """Raise an error for a value that is no tensor or has another shape. The message names the shape of ``like``."""
+    """Raise an error when a value is not a tensor of its expected shape. The message names the shape of ``like``."""
     check_tensors({name: tensor for name, (tensor, _) in shapes.items()})
     for name, (tensor, expected) in shapes.items():
         if tensor is not None and tensor.shape != expected:
@@ -95,8 +95,8 @@ def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name:
 def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
     """Choose the dtype of a computation: float64 if any tensor is float64, else float32. ``None`` is ignored.
 
-    Half precision would be too coarse for pixels, and integers have no gradient. ``TypeCheckError``: a tensor holds
-    booleans or complex numbers.
+    Half precision would be too coarse for pixels, and integers have no gradient. Raise ``TypeCheckError`` when a tensor
+    holds booleans or complex numbers.
     """
     given = {name: tensor.dtype for name, tensor in tensors.items() if tensor is not None}
     for name, dtype in given.items():
@@ -108,7 +108,7 @@ def common_dtype(tensors: Mapping[str, Tensor | None]) -> torch.dtype:
 def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) -> Tensor:
     """Check a standard deviation, and expand it to (*, N) in the dtype of world points (*, N, 3).
 
-    ``sigma`` is a number or has the shape (), (*) or (*, N). ``None`` becomes NaN. Errors call it ``name``.
+    ``sigma`` is a number or has the shape (), (*) or (*, N). ``None`` becomes NaN. Error messages use ``name``.
     """
     pairs = world_points.shape[:-1]
     if sigma is None or isinstance(sigma, int | float):

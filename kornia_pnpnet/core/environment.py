@@ -22,9 +22,9 @@ def environment() -> dict[str, Any]:
     """Describe the software and the machine of a measurement.
 
     Returns:
-        ``versions`` by package (``None``: not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
-        ``gpu`` (``None``: no GPU), ``date`` in UTC, and the git ``commit`` of the package (``None``: no checkout),
-        which ends with ``+`` if tracked files have changes.
+        ``versions`` by package (``None`` if not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
+        ``gpu`` (``None`` without a GPU), ``date`` in UTC, and the git ``commit`` of the package (``None`` outside a
+        checkout). The commit ends with ``+`` if tracked files have changes.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-#: Bytes. Largest total size of arrays of :func:`read_npz`: a compressed file of a few megabytes can contain gigabytes.
+#: Largest total size in bytes that :func:`read_npz` reads. A compressed file of a few megabytes can contain gigabytes.
 MOST_BYTES = 2**31
 
 
 class InputError(ValueError):
-    """An input file or a command-line option cannot be used. The message is one line that begins with its place."""
+    """An input file or a command-line option cannot be used. The message is one line that begins with ``source``."""
 
     def __init__(self, source: str | Path, message: str, line: int | None = None) -> None:
         place = source if line is None else f"{source}:{line}"
@@ -48,7 +48,7 @@ def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[I
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write an indented JSON file by :func:`atomic_open`. ``ValueError``: a number is not finite."""
+    """Write an indented JSON file by :func:`atomic_open`. Raise ``ValueError`` when a number is not finite."""
     with atomic_open(path, encoding="utf-8") as file:
         file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
@@ -56,9 +56,9 @@ def write_json(path: str | Path, content: Any) -> None:
 def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] = ()) -> dict[int, dict[str, str]]:
     """Read a CSV file with a header, and map the line number of each row to its cells by column name.
 
-    Blank lines and spaces around cells are dropped. Further columns are kept. ``InputError``: the file is not CSV in
-    UTF-8, one of ``columns`` is missing, one of ``columns`` or ``optional`` occurs twice, or a row has more or fewer
-    cells than the header.
+    Blank lines and spaces around cells are dropped. Further columns are kept. Raise ``InputError`` when the file is not
+    CSV in UTF-8, one of ``columns`` is missing, one of ``columns`` or ``optional`` occurs twice, or a row has more or
+    fewer cells than the header.
     """
     content = Path(path).read_bytes()
     try:
@@ -80,10 +80,10 @@ def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] =
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read those of the named arrays (``None``: all arrays) that an NPZ file has, without unpickling.
+    """Read the named arrays (or all arrays) of an NPZ file without unpickling. Missing arrays are left out.
 
-    ``ValueError``, whose message does not name the file: it is not an NPZ file of numbers, or the arrays take more than
-    :data:`MOST_BYTES`.
+    Raise ``ValueError`` when the file is not an NPZ file of numbers, or when the arrays take more than
+    :data:`MOST_BYTES`. The message does not name the file.
     """
     with path.open("rb") as file:
         try:

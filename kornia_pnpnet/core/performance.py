@@ -30,7 +30,7 @@ exporting = torch.compiler.is_exporting
 
 
 def sees_values(x: Tensor) -> bool:
-    """Whether Python code may read values. Tracing, ``torch.func.vmap`` and the device ``meta`` forbid reading."""
+    """Whether Python code may read the values. Tracing, ``torch.func.vmap`` and the device ``meta`` forbid reading."""
     if compiling():
         return False
     functorch = torch._C._functorch
@@ -68,13 +68,13 @@ if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even i
 def in_turn(x: Tensor) -> AbstractContextManager[Any]:
     """Return a context in which threads run one after the other, if ``x`` has few numbers (see :func:`are_few`).
 
-    Otherwise four threads, which wait for Python's lock at every operation, take 2.5 times the time of one thread.
+    Without turns, four threads wait for Python's lock at each operation and take 2.5 times as long as one thread.
     """
     return _TURN[0] if are_few(x) else nullcontext()
 
 
-# Numbers. For fewer numbers on a CPU, the call of an operation takes longer than its arithmetic. One 6×6 system is
-# solved by LAPACK in 55 µs, and by a loop over its entries in 293 µs.
+# Largest size of a small tensor. On a CPU, the call of an operation on a small tensor takes longer than its arithmetic.
+# For one 6×6 system, LAPACK takes 55 µs, and a loop over the entries takes 293 µs.
 _FEW_NUMBERS = 4096
 
 
@@ -111,14 +111,14 @@ def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
 
-# Bytes: the largest mmap threshold of glibc, 32 MiB (mallopt(3), M_MMAP_THRESHOLD), minus the header of an allocation.
+# Largest mmap threshold of glibc in bytes, 32 MiB (mallopt(3), M_MMAP_THRESHOLD), minus the header of an allocation.
 _LARGEST_KEPT = 2**25 - 2**16
 
 
 def keep_freed_memory() -> None:
     """Let glibc keep up to 64 MiB of freed memory for reuse, in the whole process.
 
-    Otherwise glibc requests memory from the system for each tensor of more than 128 KiB: large batches of
+    Without this call, glibc requests memory from the system for each tensor of more than 128 KiB, and large batches of
     ``pnpnet-set`` take 20 to 45 % longer. Only programs may call this function, because a library must not change the
     allocator of its process.
     """
@@ -127,8 +127,8 @@ def keep_freed_memory() -> None:
 
 # --- order ------------------------------------------------------------------------------------------------------------
 
-# Pairs. Up to this number of pairs, compiled code sorts by comparisons, which compile to one loop. For 9 pairs in each
-# of 1000 problems, the loop takes 31 µs and `Tensor.sort` 65 µs; with two keys, 60 and 200 µs.
+# Largest number of pairs that compiled code sorts by comparisons, which compile to one loop. For 9 pairs in each of
+# 1000 problems, the loop takes 31 µs and `Tensor.sort` takes 65 µs. With two keys, the times are 60 and 200 µs.
 _FEW_PAIRS = 12
 
 
@@ -158,7 +158,7 @@ def _are_few_pairs(values: Tensor) -> bool:
 
 
 def _sorted_rows(values: Tensor) -> list[Tensor]:
-    """Sort values (C, N, B) into rows (C, B) by odd-even transposition. A compiler removes comparisons without use."""
+    """Sort values (C, N, B) into rows (C, B) by odd-even transposition. A compiler removes unused comparisons."""
     rows = list(values.unbind(1))
     for i in range(len(rows)):
         for j in range(i % 2, len(rows) - 1, 2):
@@ -167,7 +167,7 @@ def _sorted_rows(values: Tensor) -> list[Tensor]:
 
 
 def present_first(present: Tensor) -> Tensor:
-    """Find positions (B, N) that move present pairs before absent pairs, without any other change of order."""
+    """Find positions (B, N) that move present pairs before absent pairs and otherwise keep the order."""
     places = torch.arange(present.shape[1], device=present.device)
     # The keys are unique, because PyTorch's top-k is not stable.
     return _ascending(torch.where(present, places, places + present.shape[1]))
@@ -190,7 +190,7 @@ def _ascending(keys: Tensor) -> Tensor:
 
 
 def _order_by_counting(*keys: Tensor) -> Tensor:
-    """The stable ascending order by keys (N, *), the first key first: count the entries that precede each entry."""
+    """The stable ascending order by keys (N, *). The first key has priority. Count the entries before each entry."""
     first = keys[0]
     position = torch.arange(first.shape[0], device=first.device).view(-1, *(1,) * (first.ndim - 1))
     before = position < position[:, None]  # entry (i, j): whether entry j precedes entry i
@@ -218,9 +218,9 @@ def _take_pairs(values: Tensor, index: Tensor) -> Tensor:
     return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
 
 
-# A compiler does not fuse a custom operation with the operations that read its result. With a fused gather, the
-# compiled hypotheses of the set network take a third longer. `torch.library.Library` is used because the first call of
-# `torch.library.custom_op` imports 800 modules in 2 to 3 s.
+# A compiler cannot fuse a custom operation with the operations that read its result. With a fused gather, the compiled
+# hypotheses of the set network take a third longer. `torch.library.Library` replaces `torch.library.custom_op`, whose
+# first call imports 800 modules in 2 to 3 s.
 _LIBRARY = torch.library.Library("kornia_pnpnet", "DEF")
 _LIBRARY.define("take_pairs(Tensor values, Tensor index) -> Tensor")
 _LIBRARY.impl("take_pairs", _take_pairs, "CompositeExplicitAutograd")
@@ -239,9 +239,9 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
 
 # --- compilation ------------------------------------------------------------------------------------------------------
 
-# Pairs. For at least this number of pairs, the CPU compiler of PyTorch 2.13 must not choose the order of loops. A
-# chosen order can transpose blocks of 16 numbers. The results are then incorrect if a problem has more pairs than the
-# batch has problems. Without this choice, compiled code takes up to 50 % longer.
+# Smallest number of pairs at which the CPU compiler of PyTorch 2.13 must not choose the order of loops. A chosen order
+# can transpose blocks of 16 numbers, and results are then incorrect if a problem has more pairs than the batch has
+# problems. With fewer pairs the compiler chooses, because compiled code otherwise takes up to 50 % longer.
 _MANY_PAIRS = 16
 
 
@@ -274,7 +274,7 @@ class Runner:
         many = first.ndim > 1 and first.shape[1] >= _MANY_PAIRS
         kind = name, first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
         if kind in self._seen:
-            with suppress(Exception):  # may be a warning raised as an error: try again below, without warnings
+            with suppress(Exception):  # a filter may raise a warning as an error: try again below, without warnings
                 return cast(_T, self._functions[name, many](*args))
         try:
             if (name, many) not in self._functions:
@@ -297,8 +297,8 @@ class Runner:
 
     def _compile(self, function: Callable[..., Any], many: bool) -> Callable[..., Any]:
         options = torch._inductor.list_mode_options(self.mode or "default") | {
-            "cpp.vec_isa_ok": True,  # skip tests of instruction sets, half of the time of the first compilation
-            "cpp.enable_loop_tail_vec": False,  # a third less time of compilation, and the same time of calls
+            "cpp.vec_isa_ok": True,  # skip tests of instruction sets, which take half of the first compilation
+            "cpp.enable_loop_tail_vec": False,  # compilation takes a third less time, calls the same time
             "guard_filter_fn": _needed_guards,
             **({"pick_loop_orders": False} if many else {}),
         }
@@ -332,7 +332,7 @@ def per_problem(scalar: Tensor, like: Tensor) -> Tensor:
 
 
 def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
-    """Make the options of AOTInductor for a number of pairs, ``None``: any number.
+    """Make the options of AOTInductor for a number of pairs; ``None`` means any number.
 
     With ``on_stack``, tensors stay on the stack if the graph calls no operator of PyTorch. Every call in a thread then
     returns the same tensors, with new values.
@@ -347,10 +347,10 @@ def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
 
 # --- packages of one problem: sorts, running sums and products as elementwise operations ------------------------------
 # A compiler fuses elementwise operations, and calls PyTorch for all other operations. AOTInductor keeps the tensors of
-# a graph on the stack if the graph never calls PyTorch: a package of `pnpnet-n9` for one problem then takes 42 instead
+# a graph on the stack if the graph never calls PyTorch. A package of `pnpnet-n9` for one problem then takes 42 instead
 # of 297 µs.
 
-# Numbers. Longer sorts and cumulative sums remain calls of PyTorch. An inline sort compares all pairs of its numbers.
+# Longest inline sort or cumulative sum. Longer ones call PyTorch: an inline sort compares each number with all others.
 _FEW_INLINE = 32
 
 

@@ -34,8 +34,8 @@ Kept = WrapValidator(_keep)
 def read_json(path: str | Path, kind: type[_T], what: str) -> _T:
     """Read a JSON file, and check its content against a type that pydantic supports.
 
-    The ``ValueError`` for other content names ``what`` was expected, and the first invalid entry: "'a.json' is not a
-    results file: rows[0].success.rate is missing".
+    Invalid content raises ``ValueError``. The message names ``what`` was expected, and the first invalid entry:
+    "'a.json' is not a results file: rows[0].success.rate is missing".
     """
     try:
         return TypeAdapter(kind).validate_json(Path(path).read_bytes(), strict=True)

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from kornia_pnpnet.core.linalg import factorise
 
-# Units in the last place of the trace. An eigenvalue counts as negative only if it is below minus this bound.
+# In units in the last place of the trace. An eigenvalue counts as negative only if it is below minus this bound.
 _ROUNDING = 16.0
-# Units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the determinant would
+# In units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the determinant would
 # otherwise be smaller than its rounding error.
 _LEAST = 64.0
 
@@ -76,7 +76,7 @@ class Symmetric3(NamedTuple):
         return cls(*_upper(matrix))
 
     def divided(self, length: Tensor) -> Symmetric3:
-        """Divide lengths by a length, and add a multiple of the identity that exceeds the entries' rounding errors."""
+        """Divide a covariance by a squared length, and add more than the rounding errors to its diagonal."""
         # An entry of 0 gives the length no gradient. The gradient would be NaN if the square of the length underflowed.
         lengths = (torch.where(x == 0, length.detach(), length) for x in self)
         xx, xy, xz, yy, yz, zz = (x / unit / unit for x, unit in zip(self, lengths, strict=True))

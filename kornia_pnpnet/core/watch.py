@@ -9,18 +9,18 @@ from torch import Tensor
 
 from kornia_pnpnet.core.performance import sees_values
 
-# Calls. The first batches of a training show whether it can learn; later calls cost nothing.
+# Number of watched batches. The first batches show whether a training can learn; later calls cost nothing.
 _CALLS = 8
 
 
 class GradientWatch:
-    """Warn once if no problem of the first 8 batches that need a gradient is ``ok``. Reads values in one call only."""
+    """Warn once if no problem of the first 8 batches that need a gradient is ``ok``. Only the 8th call reads values."""
 
     def __init__(self) -> None:
         self._solved: list[Tensor] = []
 
     def see(self, ok: Tensor, *inputs: Tensor | None) -> None:
-        """Look at ``ok`` of a batch, bool, any shape, and at whether any of the inputs requires a gradient."""
+        """Record ``ok`` of a batch, bool, of any shape, if any of the inputs requires a gradient."""
         learns = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
         # A wrapped tensor must not outlive its transform. A CUDA graph cannot contain the reading of a value.
         readable = sees_values(ok) and not torch._C._functorch.is_functorch_wrapped_tensor(ok)

@@ -29,7 +29,7 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
     point twice, the first pixel is used. Points behind the camera are dropped. All pairs of a model count as inliers.
 
     A file of matches is an ``.npz`` file of V images. The file has the arrays ``names`` (V,), ``K`` (V, 3, 3),
-    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2), which is width and height. All other names start with the index
+    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with width and height. All other names start with the index
     of an image in three digits. For example, the M matches of image 7 are ``007_img_points`` (M, 2),
     ``007_world_points`` (M, 3) and ``007_error_px`` (M,). The error is the reprojection error under the true pose.
 
@@ -68,7 +68,7 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
     """Undistort pixels of any camera model that ``pycolmap`` knows.
 
     Args:
-        camera: ``MODEL,width,height,params...``, a line of COLMAP's ``cameras.txt`` without the camera's number.
+        camera: ``MODEL,width,height,params...``, a line of COLMAP's ``cameras.txt`` without the camera's ID.
         img_points: distorted pixels, shape (N, 2).
 
     Returns:
@@ -139,7 +139,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
         intrinsics, pixels = _pinhole(image.camera, distorted)
         world_to_cam = image.cam_from_world().matrix()  # (3, 4)
         depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
-        # `~(depth <= 0)` keeps NaN depths. View then refuses the pose, which is not finite.
+        # `~(depth <= 0)` keeps points whose depth is NaN, so that `View` refuses the pose, which is not finite.
         seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
         arrays = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
         world, img, camera, rotation, translation = (torch.tensor(x, device="cpu") for x in arrays)

@@ -95,7 +95,7 @@ def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], 
 
 
 def _alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Give the field ``name`` one number of dimensions. A part without the field gets NaN, unless all parts lack it."""
+    """Give the field ``name`` equally many dimensions in all parts. If only some parts lack the field, they get NaN."""
     values = [getattr(part, name) for part in parts]
     dimensions = {0 if value is None else value.ndim for value in values}
     if len(dimensions) == 1:

@@ -16,8 +16,8 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# Distance of a near outlier's pixel in standard deviations of the noise: the range without `near_pixels`, and the
-# smallest ends of `near_pixels`. A choice: the noise itself hardly exceeds 5 standard deviations.
+# Distance of a near outlier's pixel from its point's pixel, in standard deviations of the noise: the default range, and
+# the least values of the ends of `near_pixels`. A choice: the noise itself hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
 # This number is added to n * max_ratio before rounding down. With 0.33 the result is then floor(n / 3) for n up to 15.
 _SLACK = 0.05
@@ -56,14 +56,14 @@ class OutlierMix:
             to at least 10. ``None`` means 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
-        structured_ratio: range of the ratio of structured outliers to inliers, which is uniform over the problems.
+        structured_ratio: range from which each problem draws its ratio of structured outliers to inliers uniformly.
         structured_angle: largest rotation angle in radians. The pixels of structured outliers show a rotated and
             shifted copy of the problem's points.
-        mirrored_share: probability that a problem also mirrors the copy of the points for its structured outliers.
+        mirrored_share: probability that the copy of a problem's points is also mirrored.
         crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
             leader. For each problem, the probability that an outlier joins a crowd is drawn uniformly from 0 to 1.
         max_crowds: largest number of crowds. Each problem draws its number uniformly from 1 to ``max_crowds``.
-        point_crowd_share: probability that all crowds of a problem have the leaders' world points, not their pixels.
+        point_crowd_share: probability that the crowds of a problem have the leaders' world points instead of pixels.
 
     Example:
         >>> OutlierMix().max_count(9), OutlierMix(max_ratio=0.33).max_count(9), OutlierMix(count=2).max_count(9)
@@ -146,7 +146,7 @@ def near_offsets(img_sigma: Tensor, n: int, generator: torch.Generator, pixels: 
 
 
 def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Generator) -> Tensor:
-    """Mirror, rotate and shift a copy of all points, (B, N, 3); see :class:`OutlierMix`."""
+    """Rotate, shift and possibly mirror a copy of all points, (B, N, 3); see :class:`OutlierMix`."""
     batch_size = len(cam_points)
     centre = cam_points.mean(1, keepdim=True)
     size = (cam_points - centre).square().sum(-1).mean(1).sqrt()[:, None, None]

@@ -53,7 +53,7 @@ _YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
 # Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
 # Depth maps: standard deviation of each coordinate of a map camera about the query camera, relative to the mean
-# distance of the points. A map image then shows the same points from the side by 10 to 40 degrees.
+# distance of the points. Map and query camera then see a point from directions that differ by 10 to 40 degrees.
 _BASELINE = 0.3
 # Depth maps: bounds of the change of a flying pixel's distance from its map camera, as a share of the distance.
 _FLIGHT = (-0.3, 0.6)
@@ -159,8 +159,8 @@ class FacadePoints(_View):
     """Points of one façade, or of two façades that meet at a corner, with relief.
 
     Each façade is a plane that is turned away from the camera by a random angle. A random half of the points lies
-    deeper by the relief, as in recesses. All depths also get normal noise with a tenth of the relief as the standard
-    deviation.
+    deeper by the relief, as in recesses. All depths also get normal noise, with a standard deviation of a tenth of the
+    relief.
 
     Args:
         field_of_view: range of the field of view of the square image in degrees, uniform.
@@ -229,7 +229,7 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Multiples of ``rays``, (..., 3), where the rays enter and leave a box. If enter >= leave, a ray misses."""
+    """Multiples of ``rays``, (..., 3), at which rays enter and leave a box. If enter >= leave, a ray misses the box."""
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)
 
@@ -238,19 +238,19 @@ def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
 class DepthMaps:
     r"""Errors of world points that depth cameras have measured from several map images.
 
-    Each world point comes from the depth map of one of ``maps`` cameras near the query camera. Three errors move it:
+    Each world point comes from the depth map of one of ``maps`` cameras near the query camera. Three errors occur:
 
-    - noise along the ray of the map camera, with the standard deviation :math:`a d^2 / \bar d` at the distance
-      :math:`d`. The noise of stereo and structured light grows with the square of the distance.
-    - the error of the map camera's rotation, which turns all points of one map about this camera;
+    - noise along the ray of the map camera. The standard deviation is :math:`a d^2 / \bar d` at the distance
+      :math:`d`, because the noise of stereo and structured light grows with the square of the distance.
+    - the error of the map camera's rotation. This error turns all points of one map about the map camera;
     - *flying pixels*: at the edge of an object, the measured distance lies between object and background. These pairs
       are outliers.
 
     Args:
-        depth_noise: range of :math:`a`, the noise at the mean distance :math:`\bar d`, relative to this distance. Each
+        depth_noise: range of :math:`a`, the noise at the mean distance :math:`\bar d` divided by :math:`\bar d`. Each
             problem draws a log-uniform number.
-        angle: range of the standard deviation, in degrees, of a map camera's rotation about each axis. Each problem
-            draws a log-uniform number.
+        angle: range of the standard deviation of a map camera's rotation error about each axis, in degrees. Each
+            problem draws a log-uniform number.
         flying_share: probability that a point is a flying pixel.
         maps: number of map cameras of a problem.
     """

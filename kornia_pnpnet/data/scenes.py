@@ -76,7 +76,7 @@ class Scene:
     Attributes:
         name: the scene's name.
         views: the images that observe enough points, sorted by name.
-        skipped: names of the images that were left out because they observe too few points.
+        skipped: names of the images that were left out because the images observe too few points.
         metric: whether the unit of the scene is the metre. Otherwise the unit is arbitrary.
     """
 
@@ -95,10 +95,10 @@ class Scene:
 class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
-    Each problem consists of ``n`` random points of a random image and their pixels. The pixel of a *mismatch* is the
-    pixel of a spare point of the same image. Every other pair that is an inlier of its image is an inlier of the
-    problem. ``outliers=OutlierMix(count=2)`` is the protocol's real data with outliers. Points and poses do not depend
-    on ``outliers``.
+    Each problem consists of ``n`` random points of a random image and their pixels. ``outliers`` changes the pixels of
+    some pairs: the pixel of a *mismatch* is the pixel of a spare point of the same image. All other inliers of the
+    image stay inliers. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points and poses
+    do not depend on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
     this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
@@ -109,8 +109,8 @@ class SceneProblems(RandomProblems):
             :class:`SyntheticProblems`.
         outliers: number of outliers and share of mismatches; no outliers are added when ``None``. Scenes of raw matches
             already contain outliers.
-        num_spares: number of spare points per problem. Mismatches get their pixels in turn. With the protocol's one
-            spare point, all mismatches of a problem share a pixel.
+        num_spares: number of spare points per problem. Mismatches get the pixels of the spare points in turn. With one
+            spare point, as in the protocol, all mismatches of a problem share a pixel.
 
     Raises:
         BaseError: for ``outliers`` with *near* or *structured* outliers or crowds.

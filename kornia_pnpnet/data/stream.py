@@ -18,7 +18,7 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
 
-# Number of batches that each worker draws in advance. These batches last for the duration of a validation.
+# Number of batches that each worker draws in advance. A worker then has enough work during a validation.
 _AHEAD = 4
 
 
@@ -73,7 +73,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
 
 
 def _draw_arrays(source: ProblemSource, index: int) -> Any:
-    """Draw a batch as NumPy arrays. A worker would send each tensor through shared memory of its own, which is slow."""
+    """Draw a batch as NumPy arrays. Tensors would be sent slowly, each through its own block of shared memory."""
     return tree_map_only(torch.Tensor, torch.Tensor.numpy, source.batch(index))
 
 

@@ -1,4 +1,4 @@
-"""Synthetic problems with noise and outliers: of the protocol, and of cameras with random fields of view or rigs."""
+"""Synthetic problems with noise and outliers, of the protocol and of cameras or rigs with random fields of view."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ _ANY = (0.0, math.inf)
 _AMOUNTS = {"img_sigma": _ANY, "world_sigma": _ANY, "degrees": (1.0, math.inf), "sigma_spread": (0.0, 3.0)}
 # Largest axis ratio. Up to this ratio, float32 resolves the shortest axis of a covariance.
 _MOST_RATIO = 100.0
-# Largest pixel noise of an inlier with Student noise, in standard deviations. A choice.
+# Largest pixel noise of an inlier with Student noise, in units of `img_sigma`. A choice.
 _MOST_NOISE = 10.0
 # Smallest divisor in pixels: replaces a standard deviation of 0.
 _TINY = 1e-9
 # Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87°.
 _LEAST_COSINE = 0.05
-# Largest half side of an image without `half_image`, at a focal length of 1. Points beside the camera exceed it.
+# Half the side of the largest image without `half_image`, at a focal length of 1. Some points may lie outside.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
-# The first pairs of a problem are no copies. A choice: eight originals can still hold a pose.
+# Number of first pairs of a problem that are never copies. A choice: eight pairs can still determine a pose.
 _LEAST_ORIGINALS = 8
 # Largest blur in `_bunched`, relative to the mean distance. A choice: at a blur of 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
@@ -84,15 +84,15 @@ class SyntheticProblems(RandomProblems):
             most 100. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the axes, known noise is
             given as covariances, and ``known_noise`` must be 0 or 1.
         known_noise: share of the problems that have both sigmas. With 0, batches have no sigmas. Above 0, a third of
-            the other problems have one sigma, and missing sigmas are NaN.
+            the other problems have one sigma, and each missing sigma is NaN.
         confidence_share: share of the problems that have confidences; other problems have NaN. With 0, batches have no
             confidences. The separation of inliers from outliers and the scale of the logits differ between problems.
-        bunched_share: share of the problems with a bunch. In these problems, inliers, *near* and *structured* outliers
-            lie in a part of the image. The points of other outliers come from the rest of the scene.
+        bunched_share: share of the problems in which inliers, *near* and *structured* outliers form a bunch, in a part
+            of the image. The points of all other outliers come from the rest of the scene.
         depth_maps: errors of world points that depth cameras have measured, in addition to ``world_sigma``. Known noise
-            does not include them. ``None`` means no such errors.
+            does not include these errors. ``None`` means no errors of depth cameras.
         copies_share: share of the problems with copies, as from detectors that list a place several times. In these
-            problems, up to half of the pairs are copies of other pairs. The first 8 pairs are no copies.
+            problems, a pair is a copy of another pair with a probability of up to 0.5. The first 8 pairs are no copies.
         dtype: dtype of the batches; numbers are drawn in float64.
         device: device of the batches; numbers are drawn on the CPU.
 
@@ -141,7 +141,7 @@ class SyntheticProblems(RandomProblems):
     def _draw(self, generator: torch.Generator) -> Problems:
         size, n, mix = self.batch_size, self.n, self.outliers or OutlierMix(count=0)
         pose = random_poses(size, generator, translation_sigma=self.translation_sigma, max_angle=self.max_angle)
-        # The scene has 2N points: N points of the pairs, and N points for the pixels of mismatches.
+        # The scene has 2N points: N points of the pairs, and N points for the pixels of mismatches and crowds.
         scene = (self.points or BoxPoints())(size, 2 * n, generator)
         kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
         has_other = (kind == OutlierKind.MISMATCH) | (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
@@ -201,7 +201,7 @@ class SyntheticProblems(RandomProblems):
         is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
         other = (n * unit((size, n), generator)).long()
         index = torch.where(is_copy, other, torch.arange(n))
-        # With three pairs, poses and cameras are indexed too, but the index then keeps the order.
+        # With three pairs, poses and cameras are also indexed. The index then keeps the order: no pair is a copy.
         return problems.map(lambda x: x[torch.arange(size)[:, None], index] if x.shape[1:2] == (n,) else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
@@ -215,7 +215,7 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """Reorder points, (B, 2N, 3). Where ``displaced``, (B, N), is false, pairs get the points of a bunch."""
+        """Reorder points, (B, 2N, 3), so that pairs that are not ``displaced``, (B, N), get the points of a bunch."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
         # The score of a point is the distance of its direction from the direction of the first point, plus blur.

@@ -16,7 +16,7 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["KnownInliers", "KnownInliersAndNoise"]
 
-# From the true pose, the cost reaches its minimum to 7 digits in 3 iterations, to all digits of float64 in 10.
+# From the true pose, 3 iterations reach the minimum of the cost to 7 digits, and 10 iterations to float64's precision.
 _ITERATIONS = 10
 
 
@@ -48,7 +48,7 @@ class KnownInliersAndNoise(Configured):
     problems replace the sigmas and whiten the residuals; the result is then the maximum likelihood estimate.
 
     Args:
-        img_sigma: standard deviation of a pixel coordinate. The default is that of the protocol's synthetic data.
+        img_sigma: standard deviation of a pixel coordinate. The default is the value of the protocol's synthetic data.
         world_sigma: standard deviation of a world coordinate; see ``img_sigma``.
 
     Raises:

@@ -50,7 +50,7 @@ class SeesTruth(Protocol):
 
 
 def draw_problems(source: ProblemSource, count: int) -> Problems:
-    """Take the first ``count`` problems of the batches 0, 1, ... of a source; ``ValueError`` for a count below 1.
+    """Take the first ``count`` problems of a source, from batch 0 on. Raise ``ValueError`` for a count below 1.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -77,7 +77,7 @@ def evaluate(
 
     A pose that is not finite is replaced by the identity, with ``ok`` false. Summaries are computed from errors that
     are rounded to six significant digits. The results file is written after every row. A call with the same arguments,
-    or with further solvers and data sets, continues the file. Any other evaluation is refused.
+    or with further solvers and data sets, continues the file. The file of any other evaluation is refused.
 
     Args:
         solvers: solvers by name, called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode without
@@ -87,7 +87,7 @@ def evaluate(
         path: the results file; ``None`` writes no file.
         overwrite: replace the file at ``path`` instead of continuing it.
         chunk: number of problems per call of a solver. A smaller number takes less memory.
-        repeats: smallest number of timed calls, which follow an untimed call.
+        repeats: smallest number of timed calls. One untimed call precedes the timed calls.
 
     Returns:
         Plain data: ``format``, ``code`` (digest of the package), ``environment`` (see
@@ -97,7 +97,7 @@ def evaluate(
 
         The row of a set and a solver has ``success`` (rate, low, high, total), ``rotation_error_deg`` and
         ``translation_error`` (quartiles), ``ok`` (share), ``us_per_problem`` (median of the timed calls),
-        ``per_problem`` (errors and ok), and ``environment`` where its machine differs from that of the file.
+        ``per_problem`` (errors and ok), and the entries of ``environment`` that differ from the file's, if any.
 
     Raises:
         ValueError: when ``path`` is not a results file, or holds another evaluation.
@@ -221,7 +221,7 @@ def _solve(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
 
 
 def _now(device: torch.device) -> float:
-    """The time in seconds when the device has done its work."""
+    """Wait until the device has done its work, and return the time in seconds."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

@@ -29,15 +29,15 @@ _COMPETITORS = (
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Options of RANSAC for real scenes: the best threshold of a grid from 3 to 60 px on problems of another seed from five
-# scenes, with 0, 2 and 4 outliers in 9 pairs. Success hardly changes from 6 to 20 px.
+# Options of RANSAC for real scenes. The threshold is the best of a grid from 3 to 60 px for five scenes, another seed,
+# and 0, 2 and 4 outliers in 9 pairs. Success hardly changes from 6 to 20 px.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
-# Options of RANSAC for synthetic data: the best thresholds of a grid from (3 px, 0.15 m) to (8 px, 0.4 m) on problems
-# of another seed. Success varies by one percentage point over the grid.
+# Options of RANSAC for synthetic data. The thresholds are the best of a grid from (3 px, 0.15 m) to (8 px, 0.4 m) for
+# another seed. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Optional packages by the start of solver names: module and name of the package.
+# Module and name of each optional package, keyed by the start of the names of its solvers.
 _PACKAGES = {peer.source[1].lower(): peer.source for peer in (OpenCVPnP, KorniaRs, PoseLib, PyColmap)}
 
 
@@ -74,8 +74,8 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
 
     Args:
         n: number of pairs per problem, or several such numbers.
-        sources: see :func:`~kornia_pnpnet.evaluation.problem_sets.evaluation_sets`. If none is synthetic, RANSAC gets
-            thresholds for scenes, and the bound that needs the noise is left out.
+        sources: see :func:`~kornia_pnpnet.evaluation.problem_sets.evaluation_sets`. If no source is synthetic, RANSAC
+            gets thresholds for scenes, and the bound that needs the noise is left out.
     """
     sizes = [n] if isinstance(n, int) else list(n)
     names = dict.fromkeys(competitor.format(n=size) for competitor in _COMPETITORS for size in sizes)

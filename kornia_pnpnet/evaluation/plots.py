@@ -30,8 +30,8 @@ __all__ = ["plot_errors", "plot_pose", "plot_success", "plot_training"]
 #: Colours that colour-blind readers can tell apart: the palette ``colorblind`` of seaborn.
 COLOURS = ("#0173b2", "#de8f05", "#029e73", "#d55e00", "#cc78bc", "#ca9161", "#fbafe4", "#949494", "#ece133", "#56b4e9")
 BLUE, ORANGE, GREEN, VERMILION, PINK, BROWN, _, GREY, _, SKY = COLOURS
-WIDTH = 7.2  #: Inches. The text width of a page with two columns.
-#: Settings of matplotlib while a picture is drawn. ``text.parse_math`` is off: names of solvers are not formulas.
+WIDTH = 7.2  #: Width of figures in inches: the text width of a page with two columns.
+#: Settings of matplotlib while a picture is drawn. Names of solvers are not read as formulas.
 THEME: Any = {
     **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "figure.titlesize"), 9.0),
     **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.4),
@@ -111,7 +111,7 @@ def plot_success(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 @themed
 def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
-    """Draw the cumulative distribution of the errors; ``ValueError`` for results without per-problem errors."""
+    """Draw the cumulative distribution of the errors. Raise ``ValueError`` when there are no per-problem errors."""
     panels, colours = _panels(results)
     heading = "Problems with an error of at most x; the vertical line is the limit of a success"
     figure = make_figure(WIDTH, 1.2 + 2.2 * len(panels) + 0.05 * len(colours), heading)
@@ -132,7 +132,7 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 
 def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any]]], dict[str, str]]:
-    """Group the rows by data set, and choose a colour for each solver; ``ValueError`` without rows."""
+    """Group the rows by data set, and choose a colour for each solver. Raise ``ValueError`` without rows."""
     panels: dict[str, list[Mapping[str, Any]]] = {}
     for row in results["rows"]:
         panels.setdefault(row["data"], []).append(row)

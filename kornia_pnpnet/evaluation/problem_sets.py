@@ -20,7 +20,7 @@ __all__ = ["DEFAULT_SEED", "PRIORS", "evaluation_sets"]
 DEFAULT_SEED = 12345
 
 _slab = partial(SyntheticProblems, points=SlabPoints())
-#: Synthetic sources by name. A value has the name in results files (a name of ``conf/data``) and the constructor.
+#: Synthetic sources by name. A value holds the source's name in results files and ``conf/data``, and the constructor.
 PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
     "synthetic": ("paper", SyntheticProblems),
     "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
@@ -29,7 +29,7 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
-# Problems per drawn batch. Because of this fixed size, a set of 100 problems is the start of a set of 1000 problems.
+# Problems per drawn batch. The fixed size makes a set of 100 problems the start of a set of 1000 problems.
 _DRAW_BATCH = 1000
 
 
@@ -76,8 +76,8 @@ def evaluation_sets(
         count: number of problems per set.
         seed: seed of the problems.
         metric: whether the scenes are in metres.
-        mismatches_only: make every outlier a mismatch, each with another pixel. Else about half of the outliers are
-            mismatches, and the others have random pixels.
+        mismatches_only: make every outlier a mismatch with a pixel of its own. Otherwise about half of the outliers
+            are mismatches, and all other outliers have random pixels.
         known_noise: add the standard deviations of the noise to synthetic problems. Points and pixels do not change.
         dtype: dtype of the problems, which are drawn in float64 and then converted.
 
@@ -113,7 +113,7 @@ def evaluation_sets(
                     prior, make = PRIORS[source]
                     problems = draw_problems(make(**options, **noise, batch_size=_DRAW_BATCH), count)
                     origin = {"source": prior}
-                else:  # a mismatch gets the pixel of a spare point, and no two mismatches the same pixel
+                else:  # mismatches get the pixels of spare points; `mismatches_only` needs one for each mismatch
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
                     views = SceneProblems(scene, num_spares=spares, **options, batch_size=_DRAW_BATCH)
                     problems, origin = draw_problems(views, count), {"source": scene.name, "path": source}

@@ -33,7 +33,7 @@ _SHOWN_DIFFERENCES = 3
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
     """Read the errors (float64) and ``ok`` (bool) of all problems of a row, each :math:`(B,)`.
 
-    ``ValueError`` for a row without per-problem errors. The repository's results files have only summaries.
+    Raise ``ValueError`` for a row without per-problem errors. The repository's results files have only summaries.
     """
     if "per_problem" not in row:
         raise ValueError(f"The row of '{row['solver']}' on '{row['data']}' has no per-problem errors.")
@@ -43,7 +43,7 @@ def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
 
 
 def save_results(results: Mapping[str, Any], path: str | Path) -> None:
-    """Write results to a JSON file atomically; ``ValueError`` for a number that is not finite."""
+    """Write results to a JSON file atomically. Raise ``ValueError`` for a number that is not finite."""
     with atomic_open(path, encoding="utf-8") as file:
         file.write(json.dumps(results, separators=(",", ":"), allow_nan=False) + "\n")
 
@@ -84,7 +84,7 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
     """Fill ``plan``, which has no rows, with the rows of the file at ``path``. A missing file is ignored.
 
-    ``ValueError`` names the first differences if code, versions, solvers or data sets of the file differ in the plan.
+    If code, versions, solvers or data sets of the file differ from ``plan``, ``ValueError`` names some differences.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh

@@ -48,7 +48,7 @@ A success has a rotation error below 1° and a translation error below 0.2. Inte
 def write_model_card(folder: str | Path, results: RunResults, *, name: str | None = None) -> None:
     """Write ``README.md`` into the folder of weights, with metadata for the Hugging Face Hub.
 
-    ``results`` are those of the run that trained the weights. ``name`` names the weights; ``None``: as the run.
+    ``results`` describe the run that trained the weights. By default, the weights have the name of the run.
     """
     from huggingface_hub import EvalResult, ModelCardData
 

@@ -150,7 +150,7 @@ def fit(
         fabric: a launched Fabric; one process on the CPU when ``None``.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
             only with an equal ``identity`` and equal settings, except that ``settings.updates`` may grow. The learning
-            rates and the ramp then continue as in a run of the larger number of updates.
+            rates and the ramp then follow the schedule of the longer run.
         data_workers: number of processes that draw the next batches, for each training process.
         resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
@@ -198,7 +198,7 @@ def fit(
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
     part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
-    # An update of the network alone is much faster than one with the refinement. Each phase has a bar and a speed.
+    # Updates with the refinement are much slower, so each phase has a bar and a speed of its own.
     alone = min(settings.updates, math.ceil(settings.ramp[0] * settings.updates))
     phase = ("network alone", alone) if start < alone else (_REFINES, settings.updates)
     bar = tqdm(None, *phase, initial=start, disable=not progress or history is None, unit="update", smoothing=0.0)
@@ -207,7 +207,7 @@ def fit(
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
 
     def report(since: int, before: Mapping[str, float]) -> FitReport:
-        """Report the work since an update at which the clock had the seconds ``before``."""
+        """Report the work since the update ``since``, at which the clock had the seconds ``before``."""
         clock.lap("rest")
         spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
         whole = sum(spent.values())
@@ -316,7 +316,7 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
     """Train a new PnP-Net for n = 9 for about ``seconds``, and return the path of the learning curves (CSV).
 
     The number of updates follows from a short measurement of the machine's speed. An earlier run in ``folder`` is
-    replaced. ``BaseError``: ``seconds`` is not a positive number.
+    replaced. Raise ``BaseError`` when ``seconds`` is not a positive number.
     """
     check_positive(seconds=seconds)
     folder = Path(folder)

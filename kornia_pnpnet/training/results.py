@@ -37,7 +37,7 @@ __all__ = [
 
 RESULTS_NAME = "results.json"
 # Problems per timed call, and number of timed calls. The shortest time is reported, because other work on the machine
-# only adds time.
+# can only make a call slower.
 _TIMED_PROBLEMS, _TIMED_CALLS = 1000, 10
 
 
@@ -156,7 +156,7 @@ class RunResults:
         return str(self.config.get("name") or self.initializer or "PnPNet")
 
     def lineage(self) -> list[RunResults]:
-        """The runs that trained these weights one after the other. The last entry is this run."""
+        """The runs that trained these weights, in order. The last entry is this run."""
         return [*(self.origin.lineage() if self.origin else ()), self]
 
 
@@ -214,11 +214,11 @@ def load_run(path: str | Path) -> RunResults:
 def find_results(weights: str | Path) -> RunResults | None:
     """Load the results of the run that trained some weights; ``None`` if there is no results file.
 
-    The file is in the folder of the weights or, if this folder has the name ``weights``, in the parent folder. For the
+    The file is in the folder of the weights, or in the parent folder if the folder has the name ``weights``. For the
     argument and the errors see :func:`~kornia_pnpnet.pretrained.find_weights` and :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Another folder can lie beside unrelated results.
+    # `train.py` writes weights into the folder `weights` of a run. Results beside another folder can be unrelated.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)

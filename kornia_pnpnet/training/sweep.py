@@ -39,7 +39,7 @@ class SweepTable(Callback):
 
 
 def _as_sorted(text: str) -> tuple[float, str]:
-    """Sort numbers by value, before all other texts."""
+    """Make a sort key that sorts numbers by value, before all other texts."""
     try:
         return float(text), ""
     except ValueError:
