@@ -164,7 +164,7 @@ def shown_noise(
     """Estimate the noise of pixels and points from the residuals at a pose.
 
     The noise of a point moves its pixel less if the depth is larger. The noise of a pixel does not depend on the depth.
-    Of five ratios of both kinds of noise, the ratio with the largest likelihood for Gaussian residuals is chosen.
+    Of five mixtures of both kinds of noise, the likeliest under Gaussian residuals is chosen.
 
     For the arguments see :func:`pose_covariance`. Returns its ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
     """

@@ -37,7 +37,7 @@ class LossTerms(NamedTuple):
 
     total: Tensor  #: Weighted sum of the terms. The refined distances are saturated, see :class:`PoseLoss`.
     init_rotation: Tensor  #: Chordal rotation distance of the first guess.
-    init_translation: Tensor  #: Translation distance of the first guess at the centroid of the points.
+    init_translation: Tensor  #: Distance of the first guess's translation, at the centroid of the points.
     refined_rotation: Tensor  #: Chordal rotation distance after refinement.
     refined_translation: Tensor  #: Translation distance after refinement.
     weights: Tensor  #: Cross entropy of the weights, which are inlier probabilities; 0 in :class:`PoseLoss`.

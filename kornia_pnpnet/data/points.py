@@ -31,25 +31,32 @@ __all__ = [
 Range: TypeAlias = tuple[float, float]
 
 # The numbers below are choices that cover scenes from a flat picture on a wall to a street. Lengths are in metres.
-# Slabs: half the size of the window as a tangent, largest tangent of a direction, distance.
-_SLAB_WINDOW, _SLAB_TANGENT, _SLAB_DISTANCE = (0.15, 0.8), 0.9, (10.0, 40.0)
-# Slabs: standard deviation of a slope, thickness / distance, smallest depth of the surface / distance.
-_TILT, _THICKNESS, _LEAST_SURFACE = 0.5, (0.02, 4.0), 0.3
-# Objects: distance / half-size, largest tangent of the direction to the centre, smallest ratio of a shorter axis to the
-# longest axis, share of planar objects.
-_OBJECT_DISTANCE, _OBJECT_TANGENT, _THINNEST, _PLANAR = (1.5, 40.0), 0.8, 0.05, 0.15
-# Façades: distance, largest angle in degrees between the normal and the optical axis, relief / depth, share of problems
-# with two façades.
-_FACADE_DISTANCE, _SLANT, _RELIEF, _CORNER = (4.0, 60.0), 70.0, (0.001, 0.1), 0.3
+_SLAB_WINDOW = (0.15, 0.8)  # half the size of the window in x / z and y / z
+_SLAB_TANGENT = 0.9  # largest |x / z| and |y / z| of a point
+_SLAB_DISTANCE = (10.0, 40.0)
+_TILT = 0.5  # standard deviation of a slab's slope
+_THICKNESS = (0.02, 4.0)  # of a slab, divided by its distance
+_LEAST_SURFACE = 0.3  # smallest depth of a slab's surface, divided by the distance of the slab
+_OBJECT_DISTANCE = (1.5, 40.0)  # divided by half the size of the object
+_OBJECT_TANGENT = 0.8  # largest |x / z| and |y / z| of an object's centre
+_THINNEST = 0.05  # smallest ratio of a shorter axis of an object to its longest axis
+_PLANAR = 0.15  # share of planar objects
+_FACADE_DISTANCE = (4.0, 60.0)
+_SLANT = 70.0  # largest angle in degrees between the normal of a façade and the optical axis
+_RELIEF = (0.001, 0.1)  # of a façade, divided by its depth
+_CORNER = 0.3  # share of problems with two façades
 # Smallest ratio of a façade's distance to the depth of a point. Rays that miss the façade also get this ratio.
 _LEAST_FACING = 0.05
-# Rooms: sides, height, number of pieces of furniture, smallest ratio of the depths of furniture and the wall behind.
-# Closer furniture would hide the room and is left out.
-_ROOM_SIDE, _ROOM_HEIGHT, _FURNITURE, _NEAREST = (2.0, 15.0), (2.2, 5.0), 4, 0.15
-# Drives: height of the camera, distance of the house fronts, distance of the end of the street.
-_CAMERA_HEIGHT, _STREET_SIDE, _STREET_END = (1.0, 3.0), (2.5, 20.0), (30.0, 200.0)
-# Drives: standard deviation of the yaw in degrees, share of points on cars and trees, height of an invisible ceiling.
-_YAW, _NEARER, _NOWHERE = 15.0, 0.3, 1e6
+_ROOM_SIDE = (2.0, 15.0)
+_ROOM_HEIGHT = (2.2, 5.0)
+_FURNITURE = 4  # pieces
+_NEAREST = 0.15  # smallest depth of furniture, divided by the depth of the wall behind. Closer furniture would hide it
+_CAMERA_HEIGHT = (1.0, 3.0)  # above the street
+_STREET_SIDE = (2.5, 20.0)  # distance of the house fronts
+_STREET_END = (30.0, 200.0)  # distance of the end of the street
+_YAW = 15.0  # standard deviation in degrees
+_NEARER = 0.3  # share of points on cars and trees
+_NOWHERE = 1e6  # height of an invisible ceiling
 # Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
 # Depth maps: standard deviation of each coordinate of a map camera about the query camera, relative to the mean

@@ -42,10 +42,11 @@ _WIDEST_TANGENT = math.tan(math.radians(60.0))
 _LEAST_ORIGINALS = 8
 # Largest blur in `_bunched`, relative to the mean distance. A choice: at a blur of 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
-# Choices for confidences. `_SEPARATION`: distance between the mean scores of inliers without noise and of outliers.
-# `_NOISINESS`: decrease of an inlier's score when log(1 + noise) grows by 1. `_GAIN`: factor from scores to logits.
-# `_OFFSET`: standard deviation of the offset of the logits.
-_SEPARATION, _NOISINESS, _GAIN, _OFFSET = (0.0, 4.0), (0.0, 1.0), (0.3, 3.0), 1.5
+# Choices for confidences.
+_SEPARATION = (0.0, 4.0)  # distance between the mean scores of inliers without noise and of outliers
+_NOISINESS = (0.0, 1.0)  # decrease of an inlier's score when log(1 + noise) grows by 1
+_GAIN = (0.3, 3.0)  # factor from scores to logits
+_OFFSET = 1.5  # standard deviation of the offset of the logits
 # `CameraProblems`: smallest and largest mean depth of a problem. The unit of the world is arbitrary.
 _NEAREST, _FARTHEST = 2.0, 50.0
 # `CameraProblems`: half the side of the square image, in pixels.
@@ -201,7 +202,7 @@ class SyntheticProblems(RandomProblems):
         is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
         other = (n * unit((size, n), generator)).long()
         index = torch.where(is_copy, other, torch.arange(n))
-        # With three pairs, poses and cameras are also indexed. The index then keeps the order: no pair is a copy.
+        # With n = 3, poses and cameras are also indexed, but `index` is then 0, 1, 2: no pair is a copy.
         return problems.map(lambda x: x[torch.arange(size)[:, None], index] if x.shape[1:2] == (n,) else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:

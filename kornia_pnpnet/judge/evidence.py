@@ -51,9 +51,12 @@ __all__ = [
     "updated",
 ]
 
-# Unknown noise: the smallest standard deviation of the grid in radians, the ratio of neighbouring variances, and the
-# number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
-_LEAST_ANGLE, _STEP, _SCALES = 1e-4, 8.0, 6
+# Grid of an unknown noise: its smallest standard deviation, in radians.
+_LEAST_ANGLE = 1e-4
+# Ratio of neighbouring variances.
+_STEP = 8.0
+# Number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
+_SCALES = 6
 # Given noise: `s = 8^k` has the prior log-probability k times this number.
 _UNEXPECTED = -3.0
 # Rounds of expectation and maximisation: for the share of inliers at each factor, and for the final factor and share.
@@ -77,6 +80,7 @@ LEAST_PROBABILITY = 0.9
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
 #: logarithm of ``sigma``. ``python docs/results/make.py measure --only probability`` fitted the law.
 LAW = (-1.573, 0.6221, -0.4594)
+# Ranges to which the variables of the law are clipped.
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: of the rotation in radians, and of the translation as a share of the distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3

@@ -21,23 +21,33 @@ from kornia_pnpnet.result import Alternatives, Pose
 
 __all__ = ["find_alternatives", "reconsider"]
 
-# Another pose is kept when the ratio of its likelihood to the likelihood of the refined pose exceeds the first number.
-# The logarithm of the ratio is clipped at the second number, so that the exponential does not overflow.
-_LIKELY, _LIKELIER = 1e-3, 30.0
+# Another pose is kept when the ratio of its likelihood to the likelihood of the refined pose exceeds this number.
+_LIKELY = 1e-3
+# The logarithm of the ratio is clipped at this number, so that the exponential does not overflow.
+_LIKELIER = 30.0
 # Two poses are the same minimum if their rotations differ by less than this number of radians, and if the mean point
 # moves by less than this share of its distance from the camera.
 _SAME = 0.035
 # A mirror image is refined if its residuals of most inliers are below this number times the spread of their pixels.
 _NEAR_MIRROR = 0.2
-# Rival with a larger noise: least standard deviation in radians, first entry of `Evidence.grid` with such a noise,
-# largest loss of log-likelihood per vote, and largest share of inliers of a pose that has such a rival.
-_WIDE_ANGLE, _WIDE_FROM, _GAP, _CLEAR = 6.4e-3, 4, 0.4, 0.9
-# The caller's rival: divisor of the initial variance, least angle from the pose in radians, and largest share of
-# inliers of a pose that has such a rival.
-_SMALLER, _APART, _CLEAR_OF_RIVALS = 4.0, 0.02, 0.97
-# Number of iterations of a rival with constant noise, number of further iterations, and number of iterations from each
-# start in `find_alternatives`.
-_FROZEN, _FREE, _ITERATIONS = 3, 5, 12
+# Rival with a larger noise: its least standard deviation, in radians.
+_WIDE_ANGLE = 6.4e-3
+# First entry of `Evidence.grid` with such a noise.
+_WIDE_FROM = 4
+# Largest loss of log-likelihood per vote of such a rival.
+_GAP = 0.4
+# Share of inliers from which a pose has no such rival.
+_CLEAR = 0.9
+# The caller's rival: divisor of its initial variance.
+_SMALLER = 4.0
+# Least angle between this rival and the pose, in radians.
+_APART = 0.02
+# Share of inliers from which a pose has no such rival.
+_CLEAR_OF_RIVALS = 0.97
+# Iterations of a rival: first with constant noise, then without.
+_FROZEN, _FREE = 3, 5
+# Iterations from each start in `find_alternatives`.
+_ITERATIONS = 12
 
 
 @torch.no_grad()

@@ -95,12 +95,12 @@ class EPnP(Initialiser):
 
     The control points in the camera frame are a combination of the null vectors of the projection equations. The
     coefficients have to preserve the distances between the control points. Gauss-Newton starts from four cases, with
-    one to four null vectors. Orthogonal Procrustes aligns the world with the case of the least weighted reprojection
-    error.
+    one to four null vectors. The case with the smallest weighted reprojection error is aligned by orthogonal
+    Procrustes.
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Four things differ. Two thirds of the unknowns are eliminated (see the module). Only the first null vector moves the
-    centroid in depth. The objective does not depend on the choice of the control points, and includes the algebraic
+    Four things differ. Two thirds of the unknowns are eliminated (see the module). The centroid has depth 0 in all but
+    one null vector. The objective does not depend on the choice of the control points, and includes the algebraic
     error. Planar points use the same equations, with 0 as the last vector.
 
     Four or five pairs can have up to four solutions. The solution with the least reprojection error may then be

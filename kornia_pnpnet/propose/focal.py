@@ -35,9 +35,13 @@ _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 # RANSAC for problems that the refinement did not solve. Further iterations of the refinement follow.
 _FURTHER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, min_samples=64, final_steps=1)
-# Number of steps of `_with_distortion`. Lower bound of the kernel's scale in focal lengths: value in the first step (at
-# a radius of 0.7, k1 = 0.2 shifts a pixel by 0.2 * 0.7^3 = 0.07), factor from step to step, and least value.
-_STEPS, _WIDE, _SHRINK, _LEAST = 14, 0.07, 0.6, 1e-5
+# Number of steps of `_with_distortion`.
+_STEPS = 14
+# Lower bound of the kernel's scale in the first step, in focal lengths: k1 = 0.2 shifts a pixel at a radius of 0.7 by
+# 0.2 * 0.7^3 = 0.07.
+_WIDE = 0.07
+# Factor of this bound from step to step, and its least value.
+_SHRINK, _LEAST = 0.6, 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> Inputs:

@@ -80,7 +80,7 @@ class MLPInit(Initialiser):
     """
 
     fixed_pairs = True
-    weighs_unusual = True  # unusual pairs have the weight 0
+    weighs_unusual = True  # unusual pairs keep the weight 0
 
     def __init__(self, n: int, *, world_scale: float = 1.0, img_scale: float = 1000.0) -> None:
         super().__init__(locals())

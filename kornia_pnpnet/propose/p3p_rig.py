@@ -34,8 +34,8 @@ __all__ = ["P3PRig"]
 _DISTANCES = 16
 # Largest number of solutions, and number of Newton steps.
 _SOLUTIONS, _STEPS = 8, 6
-# A pose is a solution when the relative error of each side of the triangle is below the first number, and each entry of
-# RᵀR - I is below the second number. Here R is the rotation matrix.
+# A pose is a solution when the relative error of each side of the triangle is below _EXACT, and each entry of RᵀR - I
+# is below _ORTHOGONAL. Here R is the rotation matrix.
 _EXACT, _ORTHOGONAL = 1e-3, 0.01
 
 

@@ -33,8 +33,8 @@ _INLIER, _KNOWN_INLIER = 10.0, 5.0
 _GRID_RESIDUAL = 0.04
 # Lower bound of the depth at which `search_on` converts noise of points to pixels, in normalised units.
 _NEAREST = 0.5
-# Chance that a pair of weight 0 is drawn, relative to a pair of weight 1. The second number is the same ratio for
-# confidences 0 and 1. The first number is larger, because networks mislead more often than callers.
+# _DOUBT: chance that a pair of weight 0 is drawn, relative to a pair of weight 1. _LEAST_TRUST: the same ratio for
+# confidences 0 and 1. It is smaller, because networks mislead more often than callers.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
@@ -66,8 +66,8 @@ class RANSAC(Initialiser):
         max_samples: largest number of samples of a problem.
         min_samples: smallest number of samples of a problem. Noise can make the pose of a single sample inaccurate.
         confidence: required probability that at least one sample has no outlier, in (0, 1).
-        final_steps: number of least-squares steps from the best pose. With 0 steps the pose has no gradient, which is
-            sufficient before a refinement.
+        final_steps: number of least-squares steps from the best pose. 0 steps suffice before a refinement, but then
+            the pose has no gradient.
         seed: seed of the random numbers.
 
     Raises:

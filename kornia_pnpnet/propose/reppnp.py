@@ -52,7 +52,7 @@ class REPPnP(Initialiser):
       not depend on the control points, the frame or the unit. A small ridge pulls all points toward the depth of the
       centroid, which reduces the effect of outliers.
     - Outliers are rejected by their leave-one-out error. The quantile is 50 % (paper: 25 %).
-    - A second loop rejects outliers with a rigid motion, by Gauss-Newton steps on the algebraic error. The final pose
+    - A second loop rejects outliers of a rigid motion, fitted by Gauss-Newton to the algebraic error. The final pose
       minimises this error. The paper alternates between a combination of four null vectors and a rigid motion.
     - Both loops have a fixed length. The paper's loop stops when the quantile no longer decreases.
 

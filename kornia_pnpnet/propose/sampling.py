@@ -157,7 +157,7 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Positions (P, count) of pairs in proportion to their chances, evenly spread over the order of the pairs."""
+        """Positions (P, count) of the pairs at evenly spaced values of their cumulative chances."""
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
         return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))

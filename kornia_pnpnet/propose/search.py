@@ -33,11 +33,11 @@ _DTYPE = torch.float32
 _SAMPLES_AT_ONCE = 8192
 # Number of samples in a round, divided by the number of earlier samples, and largest number of samples in a round.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
-# A round draws all remaining samples if they fill at most the first number of rounds, or are at most the second number.
+# A round draws all remaining samples if they are at most _FEW_SAMPLES, or fill at most _ROUNDS_LEFT rounds.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
-# After k samples, the first scoring of a round uses the maximum of the first number and the second number * k^(1/3)
-# pairs. If k samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then
-# 3 / w pairs contain at least one inlier with a probability of 95 %.
+# After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, at least _FIRST_PAIRS. If k
+# samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then 3 / w pairs
+# contain at least one inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
 # were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
@@ -55,8 +55,8 @@ _DAMPING = 1e-6
 # Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
 # the pose of a minimal sample than at an improved pose.
 _LIMITS = 3.0, 1.0
-# If `pose_sigma` exceeds the first number, an incorrect pose may have as many inliers as the correct pose, for example
-# in a flat scene and a narrow field of view. At least the second number of samples is then drawn.
+# If `pose_sigma` exceeds _OPEN, an incorrect pose may have as many inliers as the correct pose, for example in a flat
+# scene and a narrow field of view. At least _OPEN_SAMPLES samples are then drawn.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
 # After this number of samples, the chance that a pair is drawn is multiplied by (a + agreement)^b. The samples take as
 # long as `agreement_of_neighbours`. The numbers a and b were chosen empirically.
@@ -94,7 +94,7 @@ class Search:
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
-        rivals: the best pose of each problem at a quarter of the thresholds, without improvement, :math:`(B, 12)`.
+        rivals: the best pose of each problem by a quarter of the thresholds, never improved, :math:`(B, 12)`.
     """
 
     def __init__(

@@ -50,12 +50,15 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 # Each entry is a number of pairs and a factor. Problems with at least this number of pairs also have the samples above
 # with all ranks multiplied by the factor. These samples help if the likeliest pairs agree on an incorrect pose.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
-# Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two of them share two pairs.
+# Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two samples share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
-# Number of likeliest pairs that score each hypothesis. A squared residual of the second number of variances halves the
-# score of a pair. The third number is the score of a pair of likelihood 0, divided by that of a pair of likelihood 1.
-_MOST_JUDGES, _JUDGED, _LEAST_VOTE = 32, 50.0, 0.5
+# Number of likeliest pairs that score each hypothesis.
+_MOST_JUDGES = 32
+# The squared residual, in variances, that halves the score of a pair.
+_JUDGED = 50.0
+# Score of a pair of likelihood 0, divided by the score of a pair of likelihood 1.
+_LEAST_VOTE = 0.5
 # If the minimal samples have more slots than this number, empty slots are removed before scoring (CPU only).
 _MANY_SLOTS = 64
 # Least depth, in normalised units, at which the noise of points is converted to pixels.
