@@ -30,7 +30,7 @@ __all__ = ["monte_carlo_pose_loss"]
 _FREEDOM = 3.0
 # Scale of the prior of the translation, as a share of the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
-# Largest scale of a t distribution's rotation, in radians. Tangent vectors approximate larger rotations badly.
+# Largest rotational scale of a t distribution, in radians. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3

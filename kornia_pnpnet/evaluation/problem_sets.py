@@ -86,7 +86,7 @@ def evaluation_sets(
         prior or the scene), ``outliers``, ``mismatch_share``, ``seed`` and, for a scene, ``path``.
 
     Raises:
-        BaseError: when a source or a mix cannot be used.
+        BaseError: for invalid sources, outliers or ``n``.
         FileNotFoundError: when a source does not exist.
         ImportError: when a source needs a package that is not installed.
     """

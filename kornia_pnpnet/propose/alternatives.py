@@ -30,7 +30,7 @@ _LIKELIER = 30.0
 _SAME = 0.035
 # A mirror image is refined if its residuals of most inliers are below this number times the spread of their pixels.
 _NEAR_MIRROR = 0.2
-# Rival with a larger noise: its least standard deviation, in radians.
+# Least initial noise of the rival with a larger noise (another pose that explains the pairs), in radians.
 _WIDE_ANGLE = 6.4e-3
 # First entry of `Evidence.grid` with such a noise.
 _WIDE_FROM = 4
@@ -110,7 +110,7 @@ def reconsider(
     rival: State | None = None,
     replaced: Tensor | None = None,
 ) -> tuple[Progress, Evidence, Tensor | None]:
-    """Compare refined poses with rivals, and keep the likeliest pose if the refinement has iterations by residual.
+    """Compare refined poses with rivals, and keep the likeliest pose if ``refine.by_residual`` is positive.
 
     One rival starts from the refined pose with a larger noise, if the residuals are almost as likely with this noise.
     Another rival starts from the mirror image of the pose, if the mirror image has small residuals. The caller's rival

@@ -255,7 +255,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
 
 
 def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Half of the Gauss-Newton matrix (4, 4, C, B), half of the gradient (4, C, B), and DᵀD - LᵀL (3, 3, C, B)."""
+    r"""Half the matrix (4, 4, C, B) and gradient (4, C, B) of `_minimize`, and its misfit DᵀD - LᵀL (3, 3, C, B)."""
     vectors = _in_camera(system, depths)[:, 1:]
     columns = vectors.transpose(0, 1)
     misfit = small_product(columns, vectors) - system.gram

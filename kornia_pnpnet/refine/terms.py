@@ -95,7 +95,7 @@ def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> Norma
 
 
 class CameraTerm(NamedTuple):
-    """A prior of an unknown focal length and of radial distortion, in pixels of a problem.
+    """A prior of radial distortion and of an unknown focal length in the problem's pixels.
 
     Attributes:
         expected: the focal length that the caller expects, in pixels, shape :math:`(B,)`.

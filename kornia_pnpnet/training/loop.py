@@ -116,7 +116,7 @@ class TrainSettings:
         return min(1.0, (update + 1) / max(1, self.warmup)) * (self.final_lr + (1.0 - self.final_lr) * cosine)
 
     def ramp_factor(self, update: int) -> float:
-        """Weight of the refined terms at an update, from 0 to 1."""
+        """Weight of the refined loss terms at an update, 0 to 1."""
         start, end = (share * self.updates for share in self.ramp)
         return 0.0 if update < start else 1.0 if update >= end else (update - start) / (end - start)
 
