@@ -225,8 +225,8 @@ class Search:
     def _expect(self, at: Tensor) -> None:
         """Estimate how many samples some problems need, from the inliers of their best poses.
 
-        After `_prefer_agreement`, it is the geometric mean of the numbers for the old and for the new chances. On repeated
-        structure, neighbours of outliers agree. The number for the new chances could then end the search early.
+        After `_prefer_agreement`, it is the geometric mean of the numbers for the old and for the new chances. On
+        repeated structure, neighbours of outliers agree. The number for the new chances could then end a search early.
         """
         if not len(at):
             return
