@@ -257,6 +257,9 @@ class Search:
         of first pairs increases with ``start``, because after many samples without success inliers are rare.
         """
         poses, valid = self._solved(problems, self.samples.positions(problems, start, stop))
+        # Samples repeat after the last one of a problem. The best poses of a problem must not depend on its neighbours.
+        fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]
+        valid = valid & fresh.repeat(1, valid.shape[1] // (stop - start))
         if valid.shape[1] * self.low.shape[1] > _FEW_RESIDUALS:
             slots = present_first(valid)[:, : max(1, int(valid.sum(1).max()))]
             poses, valid = poses.gather(2, slots[:, None].expand(-1, 12, -1)), valid.gather(1, slots)
