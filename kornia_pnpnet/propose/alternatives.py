@@ -25,8 +25,8 @@ __all__ = ["find_alternatives", "reconsider"]
 _LIKELY = 1e-3
 # The logarithm of the ratio is clipped at this number, so that the exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum if their rotations differ by less than this number of radians, and if the mean point
-# moves by less than this share of its distance from the camera.
+# Two poses are the same minimum if two differences are below this number: the angle between the rotations in radians,
+# and the distance between the positions of the mean point, divided by the distance of the mean point from the camera.
 _SAME = 0.035
 # A mirror image is refined if its residuals of most inliers are below this number times the spread of their pixels.
 _NEAR_MIRROR = 0.2

@@ -81,7 +81,7 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
 
 
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
-    """Estimate the focal lengths, and a pose for the problems without a given pose.
+    """Estimate the focal lengths, and the poses if the caller gave none.
 
     RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length. The
     ``inputs`` are the result of :func:`with_nominal_focal`. The estimated ``radial`` distortion is removed from the

@@ -22,8 +22,8 @@ from kornia_pnpnet.result import Pose, PosePrior, sound_pose
 
 __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 
-# Eigenvalues of an information matrix count as 0 below this share of the largest eigenvalue or, if the matrix is scaled
-# to a unit diagonal, below this number.
+# An eigenvalue of a matrix with a unit diagonal counts as 0 if it is below this number. An eigenvalue of any other
+# information matrix counts as 0 if its ratio to the largest eigenvalue is below this number.
 _KNOWN = 1e-5
 # Squared errors are clipped at this number of squared scales of the robust kernel. Larger errors have about no weight.
 _LARGEST_RATIO = 100.0
