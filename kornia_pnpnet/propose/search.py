@@ -34,7 +34,7 @@ _SAMPLES_AT_ONCE = 8192
 # Number of samples in a round, divided by the number of earlier samples, and largest number of samples in a round.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
 # A round draws all remaining samples if they are at most _FEW_SAMPLES, or fill at most _ROUNDS_LEFT rounds.
-_ROUNDS_LEFT, _FEW_SAMPLES = 2.0, 120
+_ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
 # After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, at least _FIRST_PAIRS. If k
 # samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then 3 / w pairs
 # contain at least one inlier with a probability of 95 %.
@@ -162,15 +162,14 @@ class Search:
             if start < _PLAIN_SAMPLES <= stop and self.problem.rig is None:
                 self._prefer_agreement(active)
                 self._expect(active)
-            start, stop = stop, self._end_of_round(stop, int(totals[active].max()))
-            parts = active.split(max(1, kept_at_once(_SAMPLES_AT_ONCE, active) // (stop - start)))
-            losses, poses = map_tensors(lambda *x: torch.cat(x), *(self._round(x, start, stop) for x in parts))
-            better = losses[:, 0] < self.loss[active]
-            self._improve(active[better], losses[better], poses[better])
-            unfinished = totals[active] > stop
-            self._expect(active[better & unfinished])
-            active = active[unfinished]
-            active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
+            start, (size, most) = stop, self._sizes_of_round(stop)
+            last = totals[active] - start <= most
+            finishing, active, stop = active[last], active[~last], start + size
+            if len(finishing):
+                self._draw(finishing, start, int(totals[finishing].max()))
+            if len(active):
+                self._draw(active, start, stop)
+                active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
         return drawn
 
     def run_once(self, positions: Tensor, judges: Tensor) -> None:
@@ -244,11 +243,19 @@ class Search:
             needed = torch.where(is_open, needed.clamp(min=_OPEN_SAMPLES), needed)
         self.needed[at] = needed
 
-    def _end_of_round(self, done: int, total: int) -> int:
-        """Number of samples at the end of the next round."""
+    def _sizes_of_round(self, done: int) -> tuple[int, int]:
+        """Number of samples in the next round, and largest number of remaining samples that it draws instead."""
         size = min(max(self.plan.min_samples, int(_GROWTH * done)), _LARGEST_ROUND)
         most = max(_ROUNDS_LEFT * size, _FEW_SAMPLES if self.problem.free_focal is None else 0)
-        return total if total - done <= min(most, _LARGEST_ROUND) else done + size
+        return size, min(most, _LARGEST_ROUND)
+
+    def _draw(self, problems: Tensor, start: int, stop: int) -> None:
+        """Solve the samples ``start`` to ``stop - 1`` of some problems, and store better poses."""
+        parts = problems.split(max(1, kept_at_once(_SAMPLES_AT_ONCE, problems) // (stop - start)))
+        losses, poses = map_tensors(lambda *x: torch.cat(x), *(self._round(x, start, stop) for x in parts))
+        better = losses[:, 0] < self.loss[problems]
+        self._improve(problems[better], losses[better], poses[better])
+        self._expect(problems[better & (self.samples.totals[problems] > stop)])
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
         """Find the best poses of the samples ``start`` to ``stop - 1``: ascending losses (P, K), and poses (P, 12, K).
