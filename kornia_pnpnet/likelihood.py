@@ -18,7 +18,7 @@ from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.problem import Problem, Starts, State
+from kornia_pnpnet.problem import Inputs, Problem, Starts, State
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.refine.residual import covariance_at, information, normal_equations, project, retract, tangent
@@ -119,19 +119,24 @@ def monte_carlo_pose_loss(
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("monte_carlo_pose_loss needs the noise of the pixels: img_sigma or img_cov.")
     noisy_points = world_sigma is not None or world_cov is not None
-    checked = [
-        checked_inputs(
-            *(world_points, img_points, intrinsics, weights, mask, pose),
-            img_sigma=img_sigma,
-            world_sigma=world_sigma if noisy_points else 0.0,
-            img_cov=img_cov,
-            world_cov=world_cov,
-            init_name=name,
-        )
-        for name, pose in (("truth", truth), *(("hypotheses", pose) for pose in others))
-    ]
-    # The loss is computed in float64 if at least one pose is in float64.
-    size, inputs = max(checked, key=lambda x: x[1].world_points.dtype.itemsize)
+
+    def check(points: Tensor) -> list[tuple[torch.Size, Inputs]]:
+        return [
+            checked_inputs(
+                *(points, img_points, intrinsics, weights, mask, pose),
+                img_sigma=img_sigma,
+                world_sigma=world_sigma if noisy_points else 0.0,
+                img_cov=img_cov,
+                world_cov=world_cov,
+                init_name=name,
+            )
+            for name, pose in (("truth", truth), *(("hypotheses", pose) for pose in others))
+        ]
+
+    checked = check(world_points)
+    if len({x.world_points.dtype for _, x in checked}) > 1:  # only some poses are in float64
+        checked = check(world_points.double())
+    size, inputs = checked[0]
     noise = inputs.noise
     assert noise is not None
     known = (noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()).all(1)

@@ -178,7 +178,7 @@ class PoseTerm(NamedTuple):
         offset = centroid / size[:, None]
         pose = Pose(rotation, translation / size[:, None] + (rotation * offset[:, None]).sum(-1))
         widest = torch.full_like(size, _SCALE) if prior.scale is None else torch.where(usable, prior.scale, _SCALE)
-        widest = torch.where(widest.isinf(), widest.detach(), widest)  # an infinite scale has no gradient
+        widest = torch.where(widest < limit, widest, torch.inf)  # an infinite scale has no gradient
         sq_scale = 0.5 * widest.square() * rank.clamp(min=1.0)
         return cls(pose, information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank), usable
 
