@@ -20,6 +20,7 @@ from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.performance import INLINE, package_options
 from kornia_pnpnet.data import CameraProblems
+from kornia_pnpnet.problem import MIN_PAIRS
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.result import Pose
 from kornia_pnpnet.solver import PnPNet
@@ -282,7 +283,7 @@ class PackagedSolver:
         batch, given = (*world_points.shape, 0, 0)[:2]
         size = next((size for size in self.sizes if size >= given), max(self.sizes, default=0))
         any_number = not self.sizes or (len(self.sizes) > 1 and given <= size)
-        batch, n = self.batch or batch, max(given, 4) if any_number else size
+        batch, n = self.batch or batch, max(given, MIN_PAIRS if self.sizes else 4) if any_number else size
         weights = world_points.new_ones(batch, n) if weights is None else weights
         cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
         intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics

@@ -206,14 +206,14 @@ def test_a_package_for_several_numbers_of_pairs_pads(rig, make_problems, tmp_pat
     solver = create_solver("epnp") if rig else PnPNet(None, RobustWeightedLM(1))
     package = load_package(packaged(tmp_path, solver, (12, 8), batch=2, rig=rig))
     assert package.sizes == (8, 12)
-    for n in (5, 8, 9, 12):
+    for n in (4, 5, 8, 9, 12):
         inputs = rigs(n, 2) if rig else inputs_of(make_problems(n=n, batch=2))
         before = [x.clone() for x in inputs]
         found = package(*inputs[:4], cam_from_rig=Pose(*inputs[4:]) if rig else None)
         assert found.pair_weights.shape == (2, n)
         near(found, solver, inputs)
         assert all(torch.equal(x, y) for x, y in zip(inputs, before, strict=True))
-    for n in (3, 13):
+    for n in (2, 13):
         world, img, intrinsics, _ = inputs_of(make_problems(n=n, batch=2))
         with pytest.raises((ShapeError, ValueCheckError)):
             package(world, img, intrinsics)
