@@ -280,7 +280,7 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target``, else 0, and tell which targets have a solution."""
+    """Find points (B, N, 2) that a lens maps to ``target``, and tell which targets have one. The others get 0."""
     # The longest Newton step is half the distance of the target from the centre. The two steps after the loop carry
     # gradients to the target and the coefficients. The second of them makes second derivatives exact.
     with torch.no_grad():

@@ -51,8 +51,8 @@ def pose_covariance(
     The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the derivative of pixel
     :math:`i` with respect to the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`.
     If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-    :math:`\Sigma_i` is the covariance of the pixel (:func:`~kornia_pnpnet.refine.residual.pixel_covariance`). The
-    computation runs in float64. Gradients flow to all arguments.
+    The function cay is the Cayley transform. :math:`\Sigma_i` is the covariance of the pixel, see
+    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. All steps run in float64, with gradients to all arguments.
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
     least squares on the inliers (P. Huber, "Robust Statistics", 1981). The weights are therefore divided by their mean
@@ -166,7 +166,7 @@ def shown_noise(
     The noise of a point moves its pixel less if the depth is larger. The noise of a pixel does not depend on the depth.
     Of five mixtures of noise of pixels and points, the mixture with the largest Gaussian likelihood is chosen.
 
-    For the arguments see :func:`pose_covariance`. Returns ``img_sigma`` and ``world_sigma`` by name, shape :math:`(B,)`.
+    For arguments see :func:`pose_covariance`. Returns a dict of ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
     """
     size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose")
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)

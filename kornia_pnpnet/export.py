@@ -133,7 +133,7 @@ def export_program(
     if solver.focal == "unknown" and (solver.radial or not trait(solver.init, "estimates_noise")):
         raise ValueCheckError(
             "With an unknown focal length, only a solver with SetInit and without radial distortion can be exported."
-            " Other solvers search for the focal length, and the search depends on the data."
+            " Other solvers search for the focal length, and the number of samples depends on the data."
         )
     if rig and (solver.focal == "unknown" or solver.init is None):
         raise ValueCheckError("For rigs a solver needs an initialiser and known focal lengths.")

@@ -254,7 +254,7 @@ class Normalize(Configured):
         valid = status == Status.SOLVED.value
         without_skew = torch.addcmul(pixels[:1], camera[1] / camera[0], pixels[1:], value=-1)
         world = (rows[:3] - centroid[:, None]) / size
-        # An invalid problem becomes zeros, without gradient.
+        # All numbers of an invalid problem become 0, without gradient.
         rows = torch.where(there & valid, torch.cat((world, without_skew, pixels[1:], rows[5:])), zero)
 
         order = None

@@ -212,8 +212,8 @@ def gate_pose(pose: Pose, live: Tensor, finite: Tensor) -> Pose:
 class PosePrior(NamedTuple):
     r"""A prior of a pose, for example from the previous frame, from gravity, or from an odometer.
 
-    If :math:`(R, t)` is the true pose, the prior's pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with Gaussian
-    noise :math:`(\omega, v)`. The covariance of the noise is the inverse of ``information``. The function
+    If :math:`(R, t)` is the true pose, the prior's pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with the Cayley
+    transform cay and Gaussian noise :math:`(\omega, v)`. The covariance of the noise is the inverse of ``information``.
     :func:`~kornia_pnpnet.covariance.pose_covariance` returns covariances of the same vector :math:`(\omega, v)`.
 
     Attributes:

@@ -415,7 +415,7 @@ class PnPNet(PretrainedMixin):
         pose = gate_pose(pose, live, finite)
         with torch.no_grad():
             sigma = torch.where(finite, found.sigma * focal / frame.img_scale, 0.0)
-        # In a rig, `forward` returns the cameras as they were given.
+        # In a rig, `forward` replaces `None` by the caller's cameras.
         cameras: Any = None if intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         return PnPResult(
             *pose,
