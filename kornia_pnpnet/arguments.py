@@ -65,7 +65,7 @@ def checked_inputs(
         intrinsics = torch.eye(3, dtype=img_points.dtype, device=img_points.device)
     if intrinsics is None:
         raise TypeCheckError(
-            "intrinsics must be a tensor, got NoneType: only bearings (B, N, 3) may omit it, pixels (B, N, 2) need it."
+            "intrinsics is required with pixels (B, N, 2), got NoneType; only bearings (B, N, 3) may omit it."
         )
     check_tensors({"intrinsics": camera_matrices(intrinsics), "weights": weights})
     check_form(["*", "N", "3"], world_points=world_points)
@@ -75,9 +75,9 @@ def checked_inputs(
     size, pairs = world_points.shape[:-2], world_points.shape[:-1]
     is_rig = is_bearing or cam_from_rig is not None
     if (dist is not None or fisheye is not None) and is_rig:
-        raise ValueCheckError("dist and fisheye are for pixels of one camera: make bearings of each camera's pixels.")
+        raise ValueCheckError("dist and fisheye are for pixels of one camera: for a rig, convert pixels to bearings.")
     if weights is not None and weights.shape == (*pairs, 2):
-        got = f"one for each pair, not one for each of u and v: got {tuple(weights.shape)}"
+        got = f"one weight for each pair, not for each of u and v: got {tuple(weights.shape)}"
         raise ShapeError(f"weights must have the shape {tuple(pairs)}, {got}.")
     matrices = _cameras(intrinsics, size)
     of_pair = is_rig and matrices.ndim == len(size) + 3
@@ -166,7 +166,7 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, like: Tensor) -> Tensor:
-    """The camera matrices that the caller gave for a rig, with a last entry of 1: one per problem or one per pair."""
+    """Return the caller's cameras of a rig, one per problem or per pair, scaled so that the last entry is 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = _cameras(intrinsics, size).to(like.dtype)
@@ -175,7 +175,7 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, l
 
 
 def _cameras(intrinsics: Tensor | PinholeCamera, size: torch.Size) -> Tensor:
-    """Return camera matrices. Matrices of Kornia's cameras (one batch dimension) get the leading dimensions."""
+    """Return camera matrices. The batch dimension of Kornia's cameras is split into the leading dimensions."""
     matrices = camera_matrices(intrinsics)
     one_batch = isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3 and len(matrices) == size.numel()
     return matrices.reshape(*size, 3, 3) if one_batch else matrices

@@ -34,7 +34,7 @@ OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
 _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
 _NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
-# Names of the values of `Status`. The last name is the status of rows that were not solved.
+# Names of the values of `Status`. The last name is the status of rows that the solver cannot accept.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
 # Only problems with at least this number of pairs are padded, see `_groups`.
 _PADDED_FROM = 16
@@ -85,10 +85,10 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve a table; ``ValueCheckError`` for a missing column, ``TypeCheckError`` for a column without numbers."""
+        """Solve a table. Raise ``ValueCheckError`` if a column is missing, ``TypeCheckError`` if one has no numbers."""
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
-                raise ValueCheckError(f"no {name}")
+                raise ValueCheckError(f"the table has no column {name}")
         cells = {name: _Cells(name, table[name]) for name in INPUTS if name in table.column_names}
         counts = cells["world_points"].sizes // 3  # (rows,)
         fits = (counts >= 3) & np.logical_and.reduce([x.fit(counts) for x in cells.values()])
@@ -129,7 +129,7 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """A column of lists ``values[starts[i] : starts[i] + sizes[i]]``. Null numbers are NaN, null lists are empty."""
+    """A column. List i is ``values[starts[i] : starts[i] + sizes[i]]``. Null numbers are NaN, null lists are empty."""
 
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
         array = column.combine_chunks()

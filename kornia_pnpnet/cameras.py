@@ -1,7 +1,7 @@
 """Undistort pixels, convert pixels to bearings, make cameras that look along bearings, and project points.
 
-The *undistorted point* of a fisheye's pixel has the direction (x, y) of the pixel's ray. The length of the point is the
-angle between the ray and the optical axis, because the plane z = 1 has no point at 90 degrees.
+The *undistorted point* of a pixel lies on the pixel's ray and on the plane z = 1. Rays of a fisheye can miss the plane.
+For a fisheye, the point is the unit vector of the ray's (x, y) times the angle between the ray and the optical axis.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ __all__ = [
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 # Number of Newton steps from the distorted to the undistorted point.
 _STEPS = 12
-# Newton solutions are rejected if their relative residual exceeds this number times the root of the machine epsilon.
+# Newton solutions are rejected if their relative residual exceeds this number times the square root of eps.
 _LARGEST_RESIDUAL = 0.1
 # Largest angle from the optical axis, in radians, at which fisheye pixels are undistorted (85 degrees).
 _WIDEST = 1.4835
@@ -68,7 +68,7 @@ def undistort(
         The undistorted pixels; whether each pixel could be undistorted, bool :math:`(B, N)`; and the noise of the
         undistorted pixels. A pixel cannot be undistorted if it is outside the range of the polynomial, if it is more
         than 85 degrees off the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point
-        replaces such a pixel. The factor of isotropic noise is the root mean square of the Jacobian's singular values.
+        replaces such a pixel. Sigmas are multiplied by the root mean square of the Jacobian's singular values.
     """
     check_form(["B", "N", "2"], img_points=img_points)
     camera, _ = pinholes(intrinsics)
@@ -79,13 +79,13 @@ def undistort(
         point = torch.where(found[..., None], point, 0.0)
     pixels = transform_points(camera, flatten(point))
     if noise is not None:
-        with torch.no_grad():  # derivative of the undistorted with respect to the distorted point
+        with torch.no_grad():  # derivative of the undistorted point by the distorted point
             jacobian = _linearised(flatten, point)[1] @ _inverse(_linearised(lens, point)[1])
             eye = torch.eye(2, dtype=jacobian.dtype, device=jacobian.device)
             jacobian = torch.where(found[..., None, None], jacobian, eye)
         to_pixels = camera[:, None, :2, :2]
         jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
-        # Noise that is not finite, for example an unknown sigma, stays, and does not affect the camera's gradient.
+        # Noise that is not finite (an unknown sigma is NaN) does not change, and adds no gradient to the camera.
         factor, finite = (0.5 * jacobian.square().sum((-1, -2))).sqrt(), noise.img.isfinite()
         noise = noise._replace(img=torch.where(finite, torch.where(finite, noise.img, 0.0) * factor, noise.img))
         if noise.img_cov is not None:
@@ -100,9 +100,9 @@ def undistort(
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
     """Replace distorted pixels by pixels of pinhole cameras, see :func:`undistort`.
 
-    Pairs whose pixel cannot be undistorted are masked out. Non-finite pixels stay, so that ``Normalize`` refuses them.
+    Pairs whose pixel cannot be undistorted are masked out. A non-finite pixel stays and makes its problem invalid.
     """
-    # Results must not depend on the memory layout of the inputs, but rounding does.
+    # Rounding errors depend on the memory layout, but results must not depend on the layout of the inputs.
     inputs, dist, fisheye = map_tensors(torch.Tensor.contiguous, (inputs, dist, fisheye))
     broken = ~inputs.img_points.isfinite().all(-1)
     seen = torch.where(broken[..., None], 0.0, inputs.img_points)
@@ -176,7 +176,7 @@ def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     r"""Rotations (B, N, 3, 3) that map directions (B, N, 3) to the z axis, and which directions are valid, bool (B, N).
 
-    A direction is invalid if it is not finite, or if no entry exceeds the square root of the least normal number. An
+    A direction is invalid if it is not finite, or if no entry exceeds the square root of the smallest normal number. An
     invalid direction gets a constant rotation.
 
     Example:
@@ -280,7 +280,7 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target``, else 0, and tell which targets have a solution."""
+    """Find points (B, N, 2) that a lens maps to ``target``, and tell which targets have one. The others get 0."""
     # The longest Newton step is half the distance of the target from the centre. The two steps after the loop carry
     # gradients to the target and the coefficients. The second of them makes second derivatives exact.
     with torch.no_grad():
@@ -292,7 +292,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
             point = point + (step * (longest / step.norm(dim=-1, keepdim=True).clamp(min=longest))).nan_to_num(0.0)
         seen, jacobian = _linearised(lens, point)
         limit = _LARGEST_RESIDUAL * torch.finfo(point.dtype).eps ** 0.5 * (1.0 + target.norm(dim=-1))
-        # Beyond its maximum the polynomial has incorrect solutions. Their Jacobian mirrors or rotates the image.
+        # Beyond the maximum of the polynomial, solutions are incorrect: their Jacobian mirrors or turns the image.
         ahead = (torch.linalg.det(jacobian) > 0) & (jacobian.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
         found = ((target - seen).norm(dim=-1) < limit) & ahead
         point = torch.where(found[..., None], point, 0.0)
@@ -305,7 +305,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
 
 
 def _linearised(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:
-    """Values (B, N, 2) and central-difference Jacobians (B, N, 2, 2) of a function of single points, in one call."""
+    """Values (B, N, 2) and central-difference Jacobians (B, N, 2, 2) of a pointwise function, in one call."""
     size = torch.finfo(point.dtype).eps ** (1 / 3)
     u, v = size * torch.eye(2, dtype=point.dtype, device=point.device)
     moved = torch.cat((point, point + u, point - u, point + v, point - v), 1)

@@ -24,10 +24,10 @@ __all__ = ["pose_covariance", "shown_noise"]
 # Least eigenvalue of a regular information matrix with a unit diagonal. Smaller eigenvalues are rounding errors of
 # float64.
 _LEAST_EIGENVALUE = 1e-13
-# Largest ratio of the given focal length to the focal length that the pixels show at the pose. With a larger ratio,
-# the caller gave the intrinsics of the solver's call in place of the estimate.
+# Largest factor between the given focal length and the focal length that fits the pixels at the pose. A larger factor
+# shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
 _FOCAL_RATIO = 1.5
-# `shown_noise` tries these shares of the pixels' own noise in the mean variance. Noise of the points is the rest.
+# `shown_noise` tries these shares of pixel noise in the mean variance of a pixel. Noise of points causes the rest.
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
@@ -51,8 +51,8 @@ def pose_covariance(
     The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the derivative of pixel
     :math:`i` with respect to the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`.
     If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-    :math:`\Sigma_i` is the covariance of the pixel (:func:`~kornia_pnpnet.refine.residual.pixel_covariance`). The
-    computation runs in float64. Gradients flow to all arguments.
+    The function cay is the Cayley transform. :math:`\Sigma_i` is the covariance of the pixel, see
+    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. All steps run in float64, with gradients to all arguments.
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
     least squares on the inliers (P. Huber, "Robust Statistics", 1981). The weights are therefore divided by their mean
@@ -145,7 +145,7 @@ def pose_covariance(
         determined = (determined & is_definite & correlation.isfinite().all((1, 2)))[:, None, None]
     inverse = torch.linalg.inv_ex(torch.where(determined, matrix, eye)).inverse
 
-    # Back to the caller's world: omega does not change, v = size v_framed + (R centroid) x omega.
+    # Convert to the caller's world, in which omega is the same, and v = size v_framed + (R centroid) x omega.
     rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
     back = eye.repeat(len(matrix), 1, 1)
     back[:, 3:6, :3] = So3.hat(rotated_centroid)
@@ -164,9 +164,9 @@ def shown_noise(
     """Estimate the noise of pixels and points from the residuals at a pose.
 
     The noise of a point moves its pixel less if the depth is larger. The noise of a pixel does not depend on the depth.
-    Of five mixtures of both kinds of noise, the likeliest under Gaussian residuals is chosen.
+    Of five mixtures of noise of pixels and points, the mixture with the largest Gaussian likelihood is chosen.
 
-    For the arguments see :func:`pose_covariance`. Returns its ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
+    For arguments see :func:`pose_covariance`. Returns a dict of ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
     """
     size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose")
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)

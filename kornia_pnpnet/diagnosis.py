@@ -1,4 +1,4 @@
-"""Find the wrong convention of pairs that do not agree with the expected pose, or with any pose."""
+"""Find out which wrong convention makes the pairs disagree with the expected pose, or with every pose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["Diagnosis", "Trial", "diagnose"]
 
-# Trials are equally good if their evidence per pair differs by less than this number (noise of 1 px and of 1.28 px).
+# Trials are equally good if their evidence per pair differs by less than this number (as 1 px and 1.28 px of noise).
 _EQUAL = 0.5
 
 
@@ -31,7 +31,7 @@ class Trial(NamedTuple):
     evidence: float  #: Evidence for the pose, see :mod:`kornia_pnpnet.judge.evidence`, divided by the number of pairs.
     agree: float  #: Share of the pairs that are inliers.
     sigma: float  #: Standard deviation of a pixel coordinate, estimated from the inliers, in pixels.
-    ok: bool  #: Whether the pose is believed.
+    ok: bool  #: Whether the pose is believed, see :mod:`kornia_pnpnet.judge.evidence`.
 
 
 class Diagnosis(NamedTuple):
@@ -59,7 +59,7 @@ class Diagnosis(NamedTuple):
 def diagnose(
     world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, *, pose: Pose | None = None
 ) -> Diagnosis:
-    """Undo the usual mistakes in conventions, and tell which change makes the pairs agree with a pose.
+    """Undo common mistakes in conventions one by one, and tell which change makes the pairs agree with a pose.
 
     The mistakes are swapped pixel coordinates, a y axis that points up, a left-handed world, an incorrect principal
     point or focal length, the intrinsics of a resized image, normalised coordinates in place of pixels, and a
@@ -71,7 +71,7 @@ def diagnose(
             have the same convention.
         img_points: pixels; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``. The largest pixel coordinates stand for the size of the image.
-        pose: a pose that the pairs should agree with. Without a pose the pairs should agree with any pose.
+        pose: the expected pose. ``None``: any pose is accepted.
 
     Raises:
         BaseError: see ``PnPNet.forward``; also for bearings.
@@ -113,7 +113,7 @@ def diagnose(
 
 
 def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[Trial, ...]:
-    """Judge the poses of each trial: (T * B) problems for T names."""
+    """Judge the poses of T named trials. The batch of pairs and poses has T * B problems."""
     problem, frame = Normalize(order=False)(*pairs)
     unknown = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
     votes = Votes.of(problem, unknown)
@@ -122,7 +122,7 @@ def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[T
     ok = frame.valid & believe(seen, problem, found, unknown)[1]
     sigma = found.sigma * problem.focal / frame.img_scale
     columns = found.log_ratio / problem.weights.shape[1], found.inlier.gt(0.5).to(sigma).mean(1), sigma, ok.to(sigma)
-    rows = torch.stack(columns, -1).unflatten(0, (len(names), -1)).median(1).values.tolist()  # of the batch
+    rows = torch.stack(columns, -1).unflatten(0, (len(names), -1)).median(1).values.tolist()
     return tuple(Trial(name, a, b, c, believed > 0) for name, (a, b, c, believed) in zip(names, rows, strict=True))
 
 

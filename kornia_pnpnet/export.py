@@ -79,7 +79,7 @@ OUTPUTS = ExportedResult._fields
 _MAX_BATCH, _MAX_N = 2**20, 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
-# Name of a package's only model, and the folder of the models in the archive of a package.
+# Name of the model in a package of one model, and the folder of the models in the archive of a package.
 _MODEL, _MODELS = "model", "/data/aotinductor/"
 
 
@@ -133,8 +133,8 @@ def export_program(
         raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
     if solver.focal == "unknown" and (solver.radial or not trait(solver.init, "estimates_noise")):
         raise ValueCheckError(
-            "With an unknown focal length only a solver with SetInit and without radial distortion can be exported:"
-            " others search, and the search depends on the data."
+            "With an unknown focal length, only a solver with SetInit and without radial distortion can be exported."
+            " Other solvers search for the focal length, and the number of samples depends on the data."
         )
     if rig and (solver.focal == "unknown" or solver.init is None):
         raise ValueCheckError("For rigs a solver needs an initialiser and known focal lengths.")
@@ -150,7 +150,7 @@ def export_program(
     points = sizes if fixed is not None else {**sizes, 1: torch.export.Dim("pairs", min=4, max=_MAX_N)}
     shapes = (points, points, points if rig else sizes, points, *((points, points),) * rig)
     try:
-        with torch.no_grad(), warnings.catch_warnings(action="ignore", category=FutureWarning):  # of PyTorch's own code
+        with torch.no_grad(), warnings.catch_warnings(action="ignore", category=FutureWarning):  # PyTorch's code warns
             return torch.export.export(_Graph(copy.deepcopy(solver).float().eval()), inputs, dynamic_shapes=shapes)
     except Exception as error:
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {_reason(error)}") from error
@@ -229,7 +229,7 @@ def export_package(
 
 
 def _compiled(solver: PnPNet, n: int | None, *, batch: int | None, rig: bool) -> Any:
-    """Compile a solver, and return the files of a model of a package."""
+    """Compile a solver, and return the files of one model of a package."""
     program = export_program(solver, n, batch=batch, rig=rig)
     pairs = _fixed_n(solver, n)
     metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}

@@ -40,8 +40,8 @@ class Frame(NamedTuple):
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
-        img_scale: pixels of the problem per pixel of the caller: the geometric mean of the absolute factors of u and v,
-            in a rig the mean over the pairs, shape :math:`(B,)`.
+        img_scale: number of pixels of the problem per pixel of the caller, shape :math:`(B,)`. The number is the
+            geometric mean of the absolute factors of u and v, and in a rig also the mean over the pairs.
         order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
@@ -106,7 +106,7 @@ class Normalize(Configured):
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
     with or without skew). At least three of its pairs have a positive weight, and its points do not coincide or lie on
-    one line, even if each coordinate changes by rounding. The inputs of invalid problems are replaced by zeros, so that
+    one line, not even within the rounding of coordinates. The inputs of invalid problems are replaced by zeros, so that
     all later values and gradients are finite. A pair of weight 0 is padding. The coordinates of padding are ignored.
 
     Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
@@ -218,7 +218,7 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, typical.new_full((), _FAR_OF_FEW), _FAR) * typical
         seen = there & (off_axis <= self.f_const * _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # few pairs keep wide angles
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # few are seen: keep wide angles
         is_usual = usual.to(rows.dtype)
 
         # Compute centre and scale from the usual points. Squares are in units of the largest coordinate.
@@ -243,7 +243,7 @@ class Normalize(Configured):
             rig = sound_pose(rig, sound)
         status = torch.where(spread_out, Status.PRECISION.value, Status.DEGENERATE.value)
         status = status.masked_fill(is_precise, Status.SOLVED.value)
-        status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # invalid, or not the pixels' camera
+        status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # invalid, or does not fit the pixels
         if padded:
             status = status.masked_fill(given.sum(0) < MIN_PAIRS, Status.TOO_FEW_PAIRS.value)
         ignored = None
@@ -254,7 +254,7 @@ class Normalize(Configured):
         valid = status == Status.SOLVED.value
         without_skew = torch.addcmul(pixels[:1], camera[1] / camera[0], pixels[1:], value=-1)
         world = (rows[:3] - centroid[:, None]) / size
-        # An invalid problem becomes zeros, without gradient.
+        # All numbers of an invalid problem become 0, without gradient.
         rows = torch.where(there & valid, torch.cat((world, without_skew, pixels[1:], rows[5:])), zero)
 
         order = None

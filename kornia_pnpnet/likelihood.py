@@ -34,7 +34,7 @@ _PRIOR_TRANSLATION = 0.5
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth, as a share of the distance of the points. A smaller depth is raised, and adds to the squared residual.
+# Least depth, as a share of the distance of the points. A smaller depth is raised, and the residual gets a penalty.
 _LEAST_DEPTH = 0.02
 
 

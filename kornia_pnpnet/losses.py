@@ -99,7 +99,7 @@ class PoseLoss(nn.Module):
         translation: weight of the refined translation distance, per unit of length.
         init_translation: weight of the first guess's translation distance, per unit of length.
         refined: weight of the refined terms for ``ramp=1``. The terms of the first guess have the weight 1.
-        saturation: :math:`c`, such as the largest distance of a success; ``None``: no saturation.
+        saturation: :math:`c`, for example the largest distance that counts as a success; ``None``: no saturation.
 
     Raises:
         BaseError: for a negative weight, or a saturation that is not positive.
@@ -125,7 +125,7 @@ class PoseLoss(nn.Module):
         check_numbers(0.0, init_translation=self.init_translation, refined=self.refined)
 
     def forward(self, result: PnPResult, problems: Problems, ramp: float = 1.0) -> LossTerms:
-        r"""Compare a solver's result with the true poses; ``BaseError`` when shape, dtype or device differ.
+        r"""Compare a solver's result with the true poses. Different shapes, dtypes or devices raise ``BaseError``.
 
         Args:
             result: the result for :math:`B` problems.
@@ -146,18 +146,18 @@ class PoseLoss(nn.Module):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class SetLoss(nn.Module):
-    r"""The loss of a set network, which trains poses, inlier probabilities and noise.
+    r"""The loss of poses, inlier probabilities and noise, for training :class:`~kornia_pnpnet.propose.set.SetInit`.
 
     Translations are compared at the centroid of the points, in units of the centroid's distance. The terms are:
 
     - First guess: a weighted mean of the best hypothesis's distance and the mean distance of all hypotheses. The best
       hypothesis has most of the weight, so that hypotheses can differ.
-    - Refined pose: both distances, each divided by its limit of success, saturated as in :class:`PoseLoss`.
+    - Refined pose: the sum of both distances, each divided by its limit of success, saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
     - Negative log-likelihood of the estimated noise, given the inliers' residuals at the true pose.
 
     Args:
-        starts: number of the network's hypotheses, which are the first poses of the starts.
+        starts: number of the network's hypotheses, which are the first poses of ``guess``.
         every: weight of the mean over the hypotheses. The best hypothesis has the weight ``1 - every``.
         refined: weight of the refined term, for ``ramp=1``.
         saturation: :math:`c` of :class:`PoseLoss`, as a multiple of the limits of success.
@@ -189,7 +189,7 @@ class SetLoss(nn.Module):
 
     @full_precision
     def forward(self, result: PnPResult, problems: Problems, ramp: float, guess: Starts) -> LossTerms:
-        """See :meth:`PoseLoss.forward`. ``guess``: starts of :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`."""
+        """See :meth:`PoseLoss.forward`. ``guess`` is from :meth:`~kornia_pnpnet.solver.PnPNet.with_starts`."""
         centre = _centre(problems)
         every = [pose_distances(pose, problems.pose, centre) for pose in guess.poses[: self.starts]]
         rotation, translation = problems.pose

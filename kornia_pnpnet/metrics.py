@@ -147,8 +147,8 @@ def success_rate(successes: Tensor) -> SuccessRate:
     check_tensors({"successes": successes})
     count = successes.numel()
     if count == 0 or successes.dtype != torch.bool or successes.is_meta:
-        kind = f"{count} of {successes.dtype} on {successes.device}"
-        raise ValueError(f"successes must hold the values of bool for at least one problem, got {kind}.")
+        kind = f"{count} elements of {successes.dtype} on {successes.device}"
+        raise ValueError(f"successes must be a bool tensor with at least one element and with values, got {kind}.")
     rate = successes.to(torch.float64).mean().item()
     z = _Z_95
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)

@@ -198,7 +198,7 @@ class _OpenCV(PeerSolver):
     def flag(self) -> int:
         """Return OpenCV's constant for the method."""
         cv2, name = self.library(), self.kind + f"{self.method}".removeprefix(self.kind)
-        usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"  # for fundamental matrices
+        usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"  # finds fundamental matrices
         KORNIA_CHECK(usable, f"OpenCV {cv2.__version__} has no method {self.method} for poses.")
         return int(getattr(cv2, name))
 
@@ -236,12 +236,12 @@ class OpenCVRansac(_OpenCV, RobustPeer):
 
     The defaults were tuned on ``SyntheticProblems``, where noise of a close world point moves its pixel by 17 px.
     World points with less noise need a lower threshold. With noisy world points, ``method="SQPNP", refine=False``
-    solves more problems and takes several times as long, because SQPnP minimises an error in space.
+    solves more problems and takes several times as long, because SQPnP minimises an object-space error.
 
     Args:
         threshold: largest reprojection error of an inlier in pixels.
         iterations: largest number of RANSAC iterations.
-        confidence: probability in (0, 1) of a sample without outliers, at which RANSAC stops.
+        confidence: RANSAC stops when a sample without outliers was drawn with this probability, in (0, 1).
         method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
         refine: refine the pose of RANSAC, ``PnPResult.init``, by least squares of the inliers' reprojection errors.
         seed: seed of OpenCV's global random numbers, set before each problem.

@@ -61,7 +61,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     try:
         for name in (CONFIG_NAME, WEIGHTS_NAME):
             if not (folder / name).is_file():  # opening a pipe would block forever
-                raise ValueError(f"{name} is no file")
+                raise ValueError(f"{name} is not a regular file")
         with (folder / CONFIG_NAME).open("rb") as text:
             config = json.loads(text.read(_LARGEST_CONFIG))
         with safe_open(folder / WEIGHTS_NAME, "pt") as file:
@@ -82,7 +82,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
         if isinstance(entry, dict):
             entries += entry.items()
         elif isinstance(entry, int) and entry > (len(state) if name == "layers" else largest):
-            raise ValueCheckError(f"{folder / CONFIG_NAME}: {name} is {entry}, too large for its {WEIGHTS_NAME}.")
+            raise ValueCheckError(f"{folder / CONFIG_NAME}: {name} is {entry}, too large for {WEIGHTS_NAME}.")
     return config, state
 
 
@@ -91,7 +91,7 @@ def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
-    """Find the folder of :func:`shipped_weights`, else a local folder, else a repository of the Hugging Face Hub.
+    """Find shipped weights of this name, else a local folder, else a repository of the Hugging Face Hub.
 
     Raises:
         FileNotFoundError: when no shipped weights, folder or repository has this name.

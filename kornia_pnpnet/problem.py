@@ -135,7 +135,7 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty for poses that differ from the prior, added to losses in the search. An outlier has the loss 1.
+        """Penalty for poses that differ from the prior, added to losses in the search. The unit is an outlier's loss.
 
         The batch of the poses, for example :math:`(H, B)` or :math:`(P, H)`, broadcasts with the batch of the term.
         """
@@ -149,7 +149,7 @@ class Problem(NamedTuple):
         img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
             shape :math:`(B, N, 2)`.
         weights: weight of each pair, at least 0; 0 for padding, shape :math:`(B, N)`.
-        focal: the focal length in pixels that all pairs share, a scalar; its initial value if it is unknown.
+        focal: the focal length in pixels, a scalar for all problems. An unknown focal length has this initial value.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
         usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), else 0, shape :math:`(B, N)`.

@@ -212,8 +212,8 @@ def gate_pose(pose: Pose, live: Tensor, finite: Tensor) -> Pose:
 class PosePrior(NamedTuple):
     r"""A prior of a pose, for example from the previous frame, from gravity, or from an odometer.
 
-    If :math:`(R, t)` is the true pose, the prior's pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with Gaussian
-    noise :math:`(\omega, v)`. The covariance of the noise is the inverse of ``information``. The function
+    If :math:`(R, t)` is the true pose, the prior's pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with the Cayley
+    transform cay and Gaussian noise :math:`(\omega, v)`. The covariance of the noise is the inverse of ``information``.
     :func:`~kornia_pnpnet.covariance.pose_covariance` returns covariances of the same vector :math:`(\omega, v)`.
 
     Attributes:
@@ -243,10 +243,10 @@ class Status(IntEnum):
     DEGENERATE = 2
     #: An input is invalid: a coordinate, weight or covariance that is not finite, a sigma whose fourth power is
     #: infinite, a negative weight or sigma, a covariance that is not positive semi-definite, an invalid prior, or a
-    #: camera of a rig whose determinant is not positive.
+    #: rotation of ``cam_from_rig`` whose determinant is not positive.
     NOT_FINITE = 3
     #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``, ``fx`` or ``fy`` is 0, or almost
-    #: all pixels are 89.9 degrees off the optical axis, so that the intrinsics do not fit the pixels.
+    #: all pixels are over 89.9 degrees off the optical axis, so that the intrinsics do not fit the pixels.
     CAMERA = 4
     #: The pairs are too little evidence for the best pose. Solvers return this status for problems of three pairs; use
     #: :func:`~kornia_pnpnet.propose.p3p.p3p` for such problems.
@@ -289,7 +289,7 @@ class Alternatives(NamedTuple):
         return cls(vectors[..., None].expand(-1, -1, -1, 3), vectors, empty, empty, empty > 0)
 
 
-# Default of fields that every solver of this package sets. The type spares users a test for `None`.
+# Default of fields that every solver of this package sets. Because of the type `Any`, users need no test for `None`.
 _UNSET: Any = None
 
 
@@ -413,7 +413,7 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose, in a rig the pose of the rig.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate; ``None``: unknown, also in later fields.
+        img_sigma: standard deviation of the noise on each pixel coordinate. ``None``, here and below: unknown.
         world_sigma: standard deviation of the noise on each world coordinate.
         confidence: belief that a pair is an inlier.
         img_cov: covariance of the noise of each pixel, in place of ``img_sigma``.

@@ -40,8 +40,8 @@ __all__ = ["PnPNet"]
 
 # Largest norm of the gradient of a problem's loss with respect to normalised inputs. Usual norms are about 1.
 _LONGEST_GRADIENT = 10.0
-# Number of additional iterations from a nominal focal length. With 1000 pairs, fewer do not converge (CameraProblems,
-# seeds 4321, 4322). Radial distortion gets its gradient from these iterations, because the search has no gradient.
+# Number of additional iterations from a nominal focal length (see `_with_camera`) or with radial distortion. With 1000
+# pairs, fewer do not converge (CameraProblems, seeds 4321, 4322). Only these iterations give distortion a gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -90,21 +90,21 @@ class PnPNet(PretrainedMixin):
             :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
             :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
             adaptive in evaluation mode if the initialiser estimates the noise and the refinement has iterations.
-            Unless the effort is ``"fixed"``, poses are compared with their rivals in evaluation mode (see
+            Unless the effort is ``"fixed"``, a pose of one camera is compared with other poses in evaluation mode (see
             :func:`~kornia_pnpnet.propose.alternatives.reconsider`), and RANSAC for rigs and bearings chooses the number
             of its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in
             ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``, with a ``RuntimeWarning``
-            if the first batches of a training have none. ``"always"``: all valid problems; the gradient of each
+            if no problem of the first batches is ``ok``. ``"always"``: all valid problems; the gradient of each
             problem's loss with respect to its normalised inputs then has a norm of at most 10. To train a network from
             random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8: the problem itself and its mirror images, for which a network
             proposes different poses (see :mod:`kornia_pnpnet.propose.views`).
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
             The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
-            focal length. With ``SetInit`` the refinement starts from a nominal focal length. If the result is not
-            believed, or with another initialiser, a search with P3P finds an initial focal length. A problem is not
-            ``ok`` when the standard deviation of the logarithm of the focal length exceeds 0.15.
+            focal length. With ``SetInit`` the refinement starts from the middle of the range of focal lengths. If the
+            result is not believed, or with another initialiser, a given pose or ``radial``, a search with P3P finds an
+            initial focal length. A problem is not ``ok`` when the standard deviation of log f exceeds 0.15.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
         radial: number of coefficients of radial distortion that are estimated with an unknown focal length, 0 to 2. The
@@ -182,11 +182,11 @@ class PnPNet(PretrainedMixin):
 
         Args:
             world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. In all arguments and in the result,
-                :math:`B` stands for any number of leading dimensions. A single problem has no leading dimension.
+                :math:`B` stands for any number of leading dimensions. A single problem needs no leading dimension.
             img_points: pixels, shape :math:`(B, N, 2)`; or bearings, shape :math:`(B, N, 3)`. Bearings are directions
                 of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras without their
-                extrinsics. In a rig, each pair may have a matrix, shape :math:`(B, N, 3, 3)`. With bearings, ``None``
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras (extrinsics are
+                ignored). In a rig, each pair may have a matrix, shape :math:`(B, N, 3, 3)`. With bearings, ``None``
                 is allowed. If intrinsics are given, sigmas and thresholds of bearings are in pixels at the given focal
                 length; otherwise, they are in radians.
             weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
@@ -206,13 +206,13 @@ class PnPNet(PretrainedMixin):
                 :math:`(B, N, 3, 3)`.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. Values up to 0.001 below 0 or above 1 are rounded to 0 or 1. A pair
-                with another confidence is left out. Pairs of high confidence are drawn more often for minimal samples.
-                Confidences are an input of networks that were trained with confidences. Confidences need not be
-                calibrated.
+                with a value outside this range is left out. Pairs of high confidence are drawn more often for minimal
+                samples. Confidences are an input of networks that were trained with confidences. Confidences need not
+                be calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
-                of the refinement and of the choice of the best pose. The prior's pose is a start unless ``init`` is
-                given. ``ok`` and ``probability`` depend on the pairs alone. If the noise is unknown, the refinement
-                with a prior assumes a standard deviation of one pixel.
+                of the refinement and of the choice of the best pose. Unless ``init`` is given, the refinement also
+                starts from the prior's pose. ``ok`` and ``probability`` depend on the pairs alone. If the noise is
+                unknown, the refinement with a prior assumes a standard deviation of one pixel.
             dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
@@ -262,7 +262,7 @@ class PnPNet(PretrainedMixin):
         if self.focal == "unknown" and (rig or dist is not None or fisheye is not None):
             raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
         if rig and (alternatives or (self.init is None and inputs.init is None)):
-            raise ValueCheckError("A rig or bearings have no alternatives, and need an initialiser or `init`.")
+            raise ValueCheckError("Rigs and bearings need an initialiser or `init`, and do not support alternatives.")
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
         with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points):
             compiled = self._run.compiled or self._whole.compiled
@@ -317,12 +317,12 @@ class PnPNet(PretrainedMixin):
         return self._with_alternatives(attempt, call.alternatives) if call.alternatives else attempt.result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
-        """Set an initial value of an unknown focal length, and return whether the initial value is nominal."""
+        """Set an initial value of an unknown focal length. Return whether it is *nominal*, the middle of the range."""
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma, self.radial)
-        # A network's poses fit the nominal focal length. A caller's pose does not. After `find_focal` has replaced a
-        # doubted pose, the refinement continues by residual.
+        # A network's poses fit the nominal focal length, but a caller's pose does not. Poses of `find_focal`, which
+        # replace doubted poses, are refined by residual.
         given = inputs.init is not None or inputs.prior is not None
         free = trait(self.init, "estimates_noise") and self.refine.by_residual and not given
         if free and not self.radial:
@@ -415,7 +415,7 @@ class PnPNet(PretrainedMixin):
         pose = gate_pose(pose, live, finite)
         with torch.no_grad():
             sigma = torch.where(finite, found.sigma * focal / frame.img_scale, 0.0)
-        # In a rig, `forward` returns the cameras as they were given.
+        # In a rig, `forward` replaces `None` by the caller's cameras.
         cameras: Any = None if intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         return PnPResult(
             *pose,

@@ -1,4 +1,4 @@
-"""The command ``pnpnet``. Each command has a module: its docstring is the help, and ``run`` returns the exit code.
+"""The command ``pnpnet``. The docstring of a subcommand's module is its help, and ``run`` returns the exit code.
 
 The modules import PyTorch inside ``run``, so that errors in arguments appear at once.
 """
@@ -62,5 +62,5 @@ def _reason(error: Exception) -> str:
     if isinstance(error, (BaseError, OSError, ImportError, ValueError)):
         return reason
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate" in str(error)):
-        return f"not enough memory for so much at once: {reason}"
+        return f"not enough memory: {reason}"
     raise error

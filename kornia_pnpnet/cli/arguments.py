@@ -97,14 +97,14 @@ _SOLVER = _arg("a name of `pnpnet list`, or a folder of weights", "NAME", defaul
 _MATCHES = """CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2)
 and optionally weights (N,) and intrinsics (3, 3)"""
 _CAMERA = """a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example
-SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; errors are those of undistorted pixels"""
-_FOCAL = "estimate the focal length; SIGMA: that of the intrinsics is right up to this fraction, such as 0.1"
+SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; reprojection errors then refer to undistorted pixels"""
+_FOCAL = "unknown: estimate the focal length; SIGMA: improve the given one, which has this relative error, such as 0.1"
 _THRESHOLD = "reject correspondences with a larger reprojection error; default: reject all but the solver's inliers"
 _SOLVERS = """names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or folders
 of weights; solvers for another n are skipped; default: all installed solvers for these n, and the bounds"""
 _DATA = f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic"
 _OUTLIERS = "none, uniform (0 to n/3 per problem), numbers or shares like 50%%, separated by commas"
-_MISMATCHES = "every outlier is the pixel of another point; default: half of the outliers, the others are random pixels"
+_MISMATCHES = "every outlier gets the pixel of another point; default: half of them, the others get random pixels"
 _DURATION = "approximate duration of the training; 0 skips the training"
 #: The arguments of each command.
 ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
@@ -117,10 +117,10 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "--plot": _arg("draw pixels, reprojections and rejected correspondences", "PNG", type=_picture),
         "--threshold": _arg(_THRESHOLD, "PX", type=_positive),
         "--diagnose": _flag(
-            "try the usual mistakes (swapped columns, y up, another image size) and name the right one"
+            "undo usual mistakes (swapped columns, y up, another image size), and name the change that helps"
         ),
         "--json": _flag("print JSON on a terminal, too"),
-        "--batch": _flag("FILE are shards of many problems, or folders of shards"),
+        "--batch": _flag("every FILE is a shard (a file of many problems) or a folder of shards"),
         "--out": _arg("where --batch writes poses; default: outputs/poses", "FOLDER"),
         "--batch-size": _arg("problems per call", "B", type=_whole(1), default=10_000),
         "--overwrite": _flag("replace the picture; with --batch also solve the shards that have results"),
@@ -132,8 +132,8 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "--outliers": _arg(_OUTLIERS, "LIST", default="none,uniform"),
         "--mismatches-only": _flag(_MISMATCHES),
         "--problems": _PROBLEMS,
-        "--seed": _arg("of the problems; default: that of the published results", type=_whole(0, 2**63 - 1)),
-        "--dtype": _arg("of the problems", choices=("float32", "float64"), default="float32"),
+        "--seed": _arg("seed of the problems; default: the published results' seed", type=_whole(0, 2**63 - 1)),
+        "--dtype": _arg("dtype of the problems", choices=("float32", "float64"), default="float32"),
         "--arbitrary-unit": _UNIT,
         "--out": _arg("the results file", "JSON", default="outputs/results.json"),
         "--overwrite": _flag("replace the results file instead of continuing it"),
@@ -143,7 +143,7 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "file": _arg("the file to write, .onnx or .pt2", "FILE"),
         "--solver": _SOLVER,
         "--pairs": _arg(
-            "correspondences per problem; several: models for padded problems (.pt2); default: any number",
+            "correspondences per problem; several numbers: a .pt2 with a model for each; default: any number",
             "LIST",
             type=_counts,
         ),

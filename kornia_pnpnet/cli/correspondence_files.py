@@ -28,7 +28,7 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort the pixels (``kornia_pnpnet.data.colmap.undistort``). Where this is impossible, the weight is 0."""
+        """Undistort pixels (``kornia_pnpnet.data.colmap.undistort``). Pixels without a solution get the weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -62,7 +62,7 @@ def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
-    """Read CSV with the columns ``X,Y,Z,u,v`` and optionally ``weight``, or NPZ with the names of the result's fields.
+    """Read CSV with the columns ``X,Y,Z,u,v`` and optionally ``weight``, or NPZ with arrays named like the fields.
 
     Raise ``InputError`` for fewer than three correspondences, a missing column or array, or an invalid number.
     """
@@ -95,7 +95,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
         raise InputError(path, f"world_points of {arrays['world_points'].shape} are many problems: pass --batch")
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     arrays.setdefault("weights", np.ones(count, np.float32))
-    # A file of float32 is solved in float32, so that the solver knows the precision of the points.
+    # A file of float32 is solved in float32, so that the solver detects points for which float32 has too few digits.
     dtype = np.float32 if np.result_type(np.float32, *arrays.values()) == np.float32 else np.float64
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
     tensors = {}

@@ -1,6 +1,6 @@
-"""Solve problems beside OpenCV and PoseLib, then train for a minute.
+"""Compare solvers with OpenCV and PoseLib, then train for a minute.
 
-The problems are random, without and with outliers. The demo prints a table, trains a small network and draws pictures.
+Without --data, the problems are random. The demo prints a table, trains a small network and draws pictures.
 
   pnpnet demo --data path/to/colmap --out outputs/demo
 """
@@ -73,7 +73,7 @@ def _result(row: Mapping[str, Any]) -> str:
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first problem with the most outliers. This choice does not depend on the solver."""
+    """Draw the first problem with the most outliers. The choice does not depend on the solver."""
     import torch
 
     from kornia_pnpnet.cameras import reproject

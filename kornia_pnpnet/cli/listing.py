@@ -12,13 +12,13 @@ import argparse
 #: Descriptions of solvers by the start of their names. The longest matching key applies.
 _WHAT = {
     "pnpnet-set": "network over any number of pairs, then learned LM: the default",
-    "pnpnet-n": "the paper's network for that number of pairs, then learned LM; camera near the world's axes",
+    "pnpnet-n": "the paper's network for that number of pairs, then learned LM; for cameras near the world's axes",
     "net-": "the network alone, without refinement",
-    "epnp": "EPnP, without outliers",
+    "epnp": "EPnP, for problems without outliers",
     "epnp-lm": "EPnP, then robust LM",
     "reppnp": "EPnP that rejects outliers by their algebraic error",
     "reppnp-lm": "REPPnP, then robust LM",
-    "p3p-ransac": "RANSAC on samples of three: most outliers",
+    "p3p-ransac": "RANSAC with P3P on samples of three, for any share of outliers",
     "ransac-epnp-lm": "the paper's RANSAC on samples of seven",
     "identity-lm": "robust LM from the identity, or from a given pose",
     "opencv-": "OpenCV's solver, one problem at a time",

@@ -83,7 +83,7 @@ def solve_shards(
         elif _solver_of(target) == mark:
             kept += 1
         else:
-            raise InputError(target, f"not of this {name}: choose another folder, or replace it with --overwrite")
+            raise InputError(target, f"no results of {name} with these weights: use another folder or --overwrite")
     counts, failed = np.zeros(2, int), []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
@@ -111,7 +111,7 @@ def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
             if shard.resolve().parent == out.resolve():
                 raise InputError(shard, "the results would lie among the shards: choose another folder")
             if shards.setdefault(shard.stem, shard) != shard:
-                raise InputError(shard, f"its results would have the name of those of {shards[shard.stem]}")
+                raise InputError(shard, f"its results would have the name of the results of {shards[shard.stem]}")
     return shards
 
 

@@ -1,11 +1,11 @@
 """Find the pose of one image, or of many problems in files.
 
 The pose of one image, x_cam = R x_world + t, is printed as a table on a terminal, and as JSON into a pipe or with
---json. Standard deviations are those that the noise of the inliers implies; rotations are about the camera's axes.
+--json. Standard deviations follow from the inliers' residuals; those of the rotation are about the camera's axes.
 
   pnpnet solve matches.csv --intrinsics 3400,3400,3024,2016 --plot pose.png
 
-With an unknown focal length only the principal point counts, which is mostly the middle of the image:
+With an unknown focal length, pass 1,1 and the principal point, which is usually the middle of the image:
 
   pnpnet solve matches.csv --focal unknown --intrinsics 1,1,3024,2016
 
