@@ -131,7 +131,7 @@ class AtPose(NamedTuple):
 
     Attributes:
         projection: the points projected at the pose.
-        exponent: minus half the squared residual in variances of its pixel, about -∞ behind the camera, (B, N).
+        exponent: minus half the squared residual over the variance of its pixel, about -∞ behind the camera, (B, N).
         density: the square root of the determinant of ``precision``, (B, N) or (1, 1).
         outlier: ``Votes.outlier`` divided by ``density``, (B, N) or (B, 1).
         precision: inverse variance of each pixel, (B, N) or (1, 1), or inverse covariance.

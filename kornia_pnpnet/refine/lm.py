@@ -273,7 +273,7 @@ class RobustWeightedLM(Configured):
             mean = prior.sum(-1, keepdim=True) / (prior > 0).sum(-1, keepdim=True).clamp(min=1)
             by_residual = prior / torch.where(mean > 0, mean, 1.0)
         poses = starts.poses
-        # The memory layout of `problems_last` is (3, 3, S B) and (3, S B).
+        # In memory, rotations have the shape (3, 3, S B), and translations (3, S B), see `problems_last`.
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:

@@ -210,8 +210,8 @@ def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tenso
     """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
 
     Without noise, squared residuals are in square pixels, and the information is 1, (1, 1). With noise, all sigmas must
-    be known. Squared residuals are then in variances of their pixel, and the information is the inverse variance of
-    each pixel, (B, N), or the inverse covariance if the noise has covariances.
+    be known. Squared residuals are then divided by the variance of their pixel, and the information is the inverse
+    variance of each pixel, (B, N), or the inverse covariance if the noise has covariances.
     """
     noise = problem.noise
     if noise is None:
