@@ -7,13 +7,13 @@ ratio
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
-leaves out its three largest terms, because some pose fits any three pairs. The votes :math:`v_i` of all copies of a
-pair have the sum 1. Expectation and maximisation estimate :math:`w`. If the noise is unknown, :math:`s` takes the
-values of a grid. If the caller gave the noise, :math:`s` is 1 or, with a lower prior probability, a power of 8.
+leaves out its three largest terms, because some pose fits any three pairs. The vote :math:`v_i` is the inverse of the
+number of pairs with about the same pixel and point. Expectation-maximisation (EM) estimates :math:`w`. If the noise is
+unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1 or, with lower prior probability, a power of 8.
 
-The *evidence* is the logarithm of the mean of :math:`\exp L(s)`, minus the logarithms of the number of minimal samples
-and of the number of poses per sample. A pose is *believed* if the evidence suffices and the inliers determine the
-pose accurately.
+The *evidence* is the logarithm of the mean of :math:`\exp L(s)`, weighted by the prior probability of :math:`s`, minus
+the logarithms of the number of minimal samples and of the number of poses per sample. A pose is *believed* if the
+evidence suffices and the inliers determine the pose accurately.
 
 The results have no gradient.
 """
@@ -57,19 +57,19 @@ _LEAST_ANGLE = 1e-4
 _STEP = 8.0
 # Number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
 _SCALES = 6
-# Given noise: `s = 8^k` has the prior log-probability k times this number.
+# If the caller gave the noise, `s = 8^k` has the prior log-probability k times this number.
 _UNEXPECTED = -3.0
-# Rounds of expectation and maximisation: for the share of inliers at each factor, and for the final factor and share.
+# Rounds of EM for the share of inliers at each factor, and rounds for the final factor and share.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
-# The second kind of inliers, for the heavy tails of real residuals: their share of all inliers, and the factor of their
-# variance. With one kind of inliers, success on indoor RGB-D matches falls by 2.5 points.
+# The wide component of the inliers, for the heavy tails of real residuals: its share of the inliers, and the factor of
+# its variance. Without this component, success on indoor RGB-D matches falls by 2.5 percentage points.
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
 # Pairs are copies if both pixels and both points are in the same cell of a grid. The sizes of a cell are in focal
 # lengths and in units of the normalised world.
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
-# Number of poses of a minimal sample.
+# Largest number of poses of a minimal sample.
 _POSES = 4
 # Rows are sorted by a key, the sum of their columns times powers of this number, so that equal rows are adjacent. The
 # number is transcendental, so that different rows of integers have different keys.
@@ -84,7 +84,7 @@ LAW = (-1.573, 0.6221, -0.4594)
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: of the rotation in radians, and of the translation as a share of the distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
-# Largest `pose_sigma` of a pose that is believed. Twice this value is the largest error of a correct pose.
+# Largest `pose_sigma` of a pose that is believed. The unit of `pose_sigma` is the largest error of a correct pose.
 _OPEN = 0.5
 # Largest standard deviation of plausible noise in radians. With 0.0125, 4 % of correct poses of indoor RGB-D matches
 # (`rgbd/indoor.npz`, without a ratio test) would not be believed.
@@ -103,8 +103,8 @@ class Votes(NamedTuple):
     Attributes:
         pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
         known: whether the caller gave any noise of the problem, bool (B, 1).
-        outlier: density of an outlier's pixel, divided by the narrow part of an inlier's density at the projection, for
-            a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
+        outlier: density of an outlier's pixel, divided by the maximum of the narrow component of an inlier's density,
+            for a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
     """
 
     pairs: Tensor
@@ -114,7 +114,7 @@ class Votes(NamedTuple):
     @classmethod
     @torch.no_grad()
     def of(cls, problem: Problem, known: Tensor) -> Votes:
-        """Count the copies of pairs, and spread the outliers over a square with the variance of the usual pixels."""
+        """Count the copies of pairs, and spread outliers over a square with the variance of the usual pairs' pixels."""
         there = problem.weights > 0
         cells = torch.cat((problem.img_points / (_PIXEL_CELL * problem.focal), problem.world_points / _POINT_CELL), -1)
         pairs = torch.where(there, copies(cells.round(), there).reciprocal(), 0.0)
@@ -131,7 +131,7 @@ class AtPose(NamedTuple):
 
     Attributes:
         projection: the points projected at the pose.
-        exponent: minus half the squared residual in variances of its pixel, about -∞ behind the camera, (B, N).
+        exponent: minus half the squared residual over the variance of its pixel, about -∞ behind the camera, (B, N).
         density: the square root of the determinant of ``precision``, (B, N) or (1, 1).
         outlier: ``Votes.outlier`` divided by ``density``, (B, N) or (B, 1).
         precision: inverse variance of each pixel, (B, N) or (1, 1), or inverse covariance.
@@ -155,7 +155,7 @@ class Mixture(NamedTuple):
     Attributes:
         variance: factor of the variances of the inliers, shape (B, 1). If the problem has no noise, the unit is px².
         share: share of inliers, shape (B, 1).
-        least: lower bound of ``variance``, shape (B, 1). Otherwise few pairs could make the variance 0.
+        least: lower bound of ``variance``, shape (B, 1). Without the bound, few pairs could make the variance 0.
         total: sum of the votes, shape (B, 1).
     """
 
@@ -165,7 +165,7 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Densities (B, N) of inliers, of inliers divided by the factor of their kind (1 or 9), and of outliers."""
+        """Relative densities (B, N) of inliers, of inliers with the components divided by 1 and 9, and of outliers."""
         scaled = exponent / self.variance
         narrow, wide = scaled.exp(), (scaled / _WIDE).exp()
         share = _TAIL / (1.0 - _TAIL) / _WIDE
@@ -179,7 +179,7 @@ class Mixture(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What the pairs say about one pose of each problem.
+    """The evidence for one pose of each problem.
 
     Attributes:
         log_ratio: the evidence, shape (B,).
@@ -240,7 +240,7 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
     log_ratio = likelihood.logsumexp(0)[:, 0] - (_POSES / 6.0 * samples).log()
     best = likelihood.argmax(0, keepdim=True)
     variance, share = (x.gather(0, best)[0] for x in (factors, share))
-    # The smallest angle of the grid stands for all smaller angles.
+    # At the smallest angle of the grid, the bound is about 0, because the noise can be smaller than the grid.
     least = torch.where(best[0] > 0, _STEP**-0.5 * variance, torch.finfo(share.dtype).eps ** 2 * variance)
     mixture = Mixture(variance, share, least, total)
     for _ in range(_FINAL_ROUNDS):
@@ -264,7 +264,7 @@ def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
 
 @torch.no_grad()
 def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None = None) -> Mixture:
-    """One round of expectation and maximisation. ``frozen`` problems, bool (B, 1), keep their variance.
+    """Run one round of EM. Problems that are ``frozen``, bool (B, 1), keep their variance.
 
     ``None``: problems are frozen if the caller gave their noise.
     """
@@ -282,11 +282,11 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 
 @torch.no_grad()
 def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The :func:`probability` of a pose, whether it is believed, bool, and its :func:`pose_sigma`, all (B,).
+    """The :func:`probability` of a pose, whether the pose is believed, bool, and its :func:`pose_sigma`, all (B,).
 
     The probability must be at least `LEAST_PROBABILITY`, and :func:`pose_sigma` must be small. The points of the
-    inliers must span more than a line. The noise must be plausible, or at most the caller's noise, if ``known`` (B, 1),
-    because pairs of a wrong convention, such as mirrored pixels, show much noise at their best pose.
+    inliers must span more than a line. The noise must be plausible, because pairs of a wrong convention, such as
+    mirrored pixels, have large residuals. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
@@ -315,7 +315,7 @@ def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
     """Standard deviation of the pose in units of the largest errors of a correct pose, float64, (B,).
 
-    The result adds the variances of rotation, translation and an unknown focal length (as a change of the distance).
+    The variance is the sum for rotation, translation and an unknown focal length (as a change of the distance).
     ``precision`` is the inverse variance (or covariance) of each pixel in px^-2, (B, N), 0 for outliers. The result is
     infinite for an undetermined pose.
     """

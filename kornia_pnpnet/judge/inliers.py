@@ -1,7 +1,7 @@
 r"""Find the inliers of a pose by thresholds.
 
 A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
-:math:`\tau` is in pixels, the threshold :math:`\omega` is a shift of the world point. The ratio of both sides is the
+:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. The ratio of both sides is the
 *standardised* squared residual.
 """
 

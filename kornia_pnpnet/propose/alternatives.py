@@ -28,23 +28,23 @@ _LIKELIER = 30.0
 # Two poses are the same minimum if two differences are below this number: the angle between the rotations in radians,
 # and the distance between the positions of the mean point, divided by the distance of the mean point from the camera.
 _SAME = 0.035
-# A mirror image is refined if its residuals of most inliers are below this number times the spread of their pixels.
+# A mirror image is refined if most inliers have residuals below this number times the spread of the inliers' pixels.
 _NEAR_MIRROR = 0.2
-# Least initial noise of the rival with a larger noise (another pose that explains the pairs), in radians.
+# Rivals are other poses that may explain the pairs. Least initial noise of the rival with a larger noise, in radians.
 _WIDE_ANGLE = 6.4e-3
-# First entry of `Evidence.grid` with such a noise.
+# First entry of `Evidence.grid` with at least this noise.
 _WIDE_FROM = 4
-# Largest loss of log-likelihood per vote of such a rival.
+# This rival is tried only if the larger noise lowers the log-likelihood by less than this number per vote.
 _GAP = 0.4
-# Share of inliers from which a pose has no such rival.
+# This rival is tried only if the share of inliers is below this number.
 _CLEAR = 0.9
-# The caller's rival: divisor of its initial variance.
+# Divisor of the initial variance of a given rival (argument `rival` of `reconsider`), if the noise is unknown.
 _SMALLER = 4.0
-# Least angle between this rival and the pose, in radians.
+# A given rival is tried only if its rotation differs from the pose by more than this angle, in radians.
 _APART = 0.02
-# Share of inliers from which a pose has no such rival.
+# A given rival is tried only if the share of inliers is below this number.
 _CLEAR_OF_RIVALS = 0.97
-# Iterations of a rival: first with constant noise, then without.
+# Iterations of a rival: first with constant noise, then with estimated noise.
 _FROZEN, _FREE = 3, 5
 # Iterations from each start in `find_alternatives`.
 _ITERATIONS = 12
@@ -112,10 +112,10 @@ def reconsider(
 ) -> tuple[Progress, Evidence, Tensor | None]:
     """Compare refined poses with rivals, and keep the likeliest pose if ``refine.by_residual`` is positive.
 
-    One rival starts from the refined pose with a larger noise, if the residuals are almost as likely with this noise.
-    Another rival starts from the mirror image of the pose, if the mirror image has small residuals. The caller's rival
-    is used if it differs from the pose, and starts with a smaller noise. A rival that ends more than 10 degrees from
-    the result lowers the probability of the result.
+    If the noise is unknown, one rival starts from the refined pose with a larger noise that is almost as likely. One
+    rival starts from the mirror image of the pose, if the mirror image has small residuals. A given rival is used if
+    its rotation differs from the pose. If the noise is unknown, a given rival starts with a smaller noise. A rival that
+    ends more than 10 degrees from the result lowers the probability of the result.
 
     Args:
         refine: the refiner.
@@ -123,14 +123,14 @@ def reconsider(
         now: the refined poses.
         found: the evidence for the refined poses.
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
-        rival: the caller's rivals. ``None``: the caller has none.
-        replaced: whether the caller's rival replaces the refined pose of a problem, bool, shape :math:`(B,)`. Such a
-            rival starts with the noise of its own residuals. The caller's rivals of all other problems are ignored.
+        rival: given rivals, such as those of ``search_on``. ``None``: no given rivals.
+        replaced: whether the given rival replaces the refined pose of a problem, bool, shape :math:`(B,)`. Such a rival
+            starts with the noise of its own residuals. The given rivals of all other problems are ignored.
             ``None``: the likelihood selects the pose of every problem.
 
     Returns:
         For :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for them, and their
-        log-odds against the rivals.
+        log-odds against the rivals; ``None``: no problem has a rival.
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
     with torch.no_grad():
@@ -219,7 +219,7 @@ def _half_turn(axis: Tensor) -> Tensor:
 
 
 def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor, ...]:
-    """Solve P3P for three likely pairs that lie far apart. ``fallback`` replaces the invalid ones of the four poses."""
+    """Solve P3P for three likely pairs that lie far apart. ``fallback`` replaces invalid poses among the four."""
     likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
     points, rows = problem.world_points, torch.arange(len(weights), device=weights.device)[:, None]
 

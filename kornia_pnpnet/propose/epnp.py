@@ -2,8 +2,8 @@ r"""EPnP: a pose from four or more pairs. A closed-form solution is refined by G
 
 A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`. The coordinates :math:`a_{ij}` are
 the same in the world frame and in the camera frame. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3` are
-*vectors* from the centroid, so that the coordinates are orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`. (Lepetit et
-al. use four points and barycentric coordinates.)
+*vectors* from the centroid. These vectors make the coordinates orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`.
+(Lepetit et al. use four points and barycentric coordinates.)
 
 The projection equations are :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0` and :math:`\sum_j a_{ij} (y_j - v_i z_j) = 0`.
 For given depths :math:`z` of the control points, the least-squares solutions are :math:`x = P z` and :math:`y = Q z`,

@@ -21,7 +21,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["propose"]
 
-# An unusual pair (`Problem.usual`) is used only if its residual at a first pose is below this number of focal lengths.
+# An unusual pair (`Problem.usual`) is used if its residual at a proposed pose is below this number of focal lengths.
 _SEEN = 0.25
 # Inlier threshold for rigs, in focal lengths.
 _THRESHOLD = 0.01

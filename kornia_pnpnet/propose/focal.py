@@ -48,9 +48,9 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> 
     """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
 
     With ``sigma``, the standard deviation of log f, the range lies around the caller's focal length. Otherwise the
-    range is proportional to the size of the image. The size is twice the principal point or, if larger, the extent of
-    the pixels. Aspect ratio and signs of fx and fy are kept. Matrices that are no pinhole cameras become NaN.
-    ``radial`` is the number of coefficients of radial distortion to estimate.
+    range is proportional to the size of the image. The size is twice the principal point or, if larger, an estimate
+    from the median distance of the pixels. Aspect ratio and signs of fx and fy are kept. Matrices that are no pinhole
+    cameras become NaN. ``radial`` is the number of coefficients of radial distortion to estimate.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = focal_length(camera)  # (B,)
@@ -113,9 +113,9 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 @torch.no_grad()
 def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, Tensor]:
-    """Run RANSAC on problems that are ``doubted`` (B,), and replace their poses and focal lengths.
+    """Run RANSAC on ``doubted`` problems, bool (B,), whose refined poses are not ``ok``, and replace these states.
 
-    Also returns for which problems RANSAC found a pose, bool (B,).
+    Also returns for which problems RANSAC found a pose, bool (B,). All other problems keep their states.
     """
     rows = doubted.nonzero()[:, 0]
     if not len(rows):

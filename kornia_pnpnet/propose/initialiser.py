@@ -26,7 +26,7 @@ class Initialiser(Configured):
         finds_focal: whether the initialiser estimates an unknown focal length.
         estimates_noise: whether the result contains several poses and the noise. Such an initialiser accepts
             ``forward(problem, search_follows=True)``.
-        weighs_unusual: whether the weights of unusual pairs (see ``Problem.usual``) are also valid.
+        weighs_unusual: whether the weights of unusual pairs (see ``Problem.usual``) are final, or `propose` sets them.
     """
 
     pairs_at_once: int | None = None

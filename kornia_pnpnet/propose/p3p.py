@@ -88,7 +88,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """The real root ``u : v`` of a cubic form (4, C) that is farthest from the other two roots.
 
-    When two solutions of a P3P problem nearly coincide, two roots also do. The third root gives a line through both.
+    If two solutions of P3P nearly coincide, two roots also do. The other root gives a line through both solutions.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -331,7 +331,7 @@ class _Solve(torch.autograd.Function):
 
 
 def minimal_poses(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype. Fifth powers must neither overflow nor underflow.
+    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype. Fifth powers must not overflow or underflow.
 
     Returns the entries (12, 4, B) of :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which slots are valid, (4, B).
     """

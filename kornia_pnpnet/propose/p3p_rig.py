@@ -8,7 +8,7 @@ direction :math:`r_k`. The unknowns are the distances :math:`d_k > 0` along the 
 
 There are up to eight solutions (D. Nistér, "A minimal solution to the generalised 3-point pose problem", CVPR 2004).
 For a given :math:`d_1`, one equation has up to two solutions :math:`d_2`, and another has up to two solutions
-:math:`d_3`. Both are real in one interval of :math:`d_1`. On each of the four branches, the third equation is a
+:math:`d_3`. All four are real in one interval of :math:`d_1`. On each of the four branches, the third equation is a
 function of :math:`d_1` alone. Newton's method starts where the sign of one of these functions changes.
 
 The last dimension of every tensor is the batch of B problems or M solutions.
@@ -60,7 +60,7 @@ class _Branches(NamedTuple):
         return cls(ahead, 1.0 + gain, offset - ahead * ray, change - gain * ray, sq_side)
 
     def interval(self) -> tuple[Tensor, Tensor]:
-        """Least and largest distance of pair 1 with real solutions. Without any, the least distance is larger."""
+        """Least and largest distance of pair 1 with real solutions. Without real solutions, the least is larger."""
         sq_tilt = self.tilt.square().sum(0).clamp(min=torch.finfo(self.tilt.dtype).eps ** 2)  # for parallel rays
         middle = -(self.aside * self.tilt).sum(0) / sq_tilt
         sq_half = middle.square() + (self.sq_side - self.aside.square().sum(0)) / sq_tilt
@@ -144,7 +144,7 @@ def _starts(
 def _newton(
     world_points: Tensor, rays: Tensor, centres: Tensor, sides: Tensor, ranges: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations, translations, and whether both are a solution, by Newton's method from the ``ranges`` (3, M)."""
+    """Rotations, translations, and whether both are a solution, by Newton's method from distances ``ranges`` (3, M)."""
     first, second = [0, 0, 1], [1, 2, 2]
     for step in range(_STEPS + 1):
         points = centres + ranges[:, None] * rays

@@ -34,18 +34,18 @@ _GRID_RESIDUAL = 0.04
 # Lower bound of the depth at which `search_on` converts noise of points to pixels, in normalised units.
 _NEAREST = 0.5
 # _DOUBT: chance that a pair of weight 0 is drawn, relative to a pair of weight 1. _LEAST_TRUST: the same ratio for
-# confidences 0 and 1. It is smaller, because networks mislead more often than callers.
+# confidences 0 and 1. This ratio is smaller, because a caller's confidences are more reliable than a network's weights.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
 class RANSAC(Initialiser):
     r"""The pose with the best score among the poses of many samples, improved on its inliers.
 
-    The samples of all problems are solved as one batch, in rounds. After each round the best pose of a problem is
-    improved by least squares on its inliers (LO-RANSAC). The search of a problem ends when the probability that a
-    sample without outliers was drawn reaches ``confidence``. If a problem has at most ``max_samples`` possible samples,
-    no sample is drawn twice. All problems and calls share the same random numbers, so that, up to rounding, the result
-    of a problem does not depend on the batch. Pairs of a large confidence are drawn more often than other pairs.
+    The samples of all problems are solved as one batch, in rounds. If a round finds a better pose, least squares on
+    the inliers improve this pose (LO-RANSAC). The search of a problem ends when the probability that a sample without
+    outliers was drawn reaches ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
+    drawn twice. All problems and calls share the same random numbers, so that, up to rounding, the result of a problem
+    does not depend on the batch. Pairs of a large confidence are drawn more often than other pairs.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
     least squares, the weight of an inlier is the inverse of the right-hand side. The final steps multiply this weight
@@ -61,8 +61,8 @@ class RANSAC(Initialiser):
             :class:`~kornia_pnpnet.propose.minimal.SubsetSolver`.
         threshold: :math:`\tau` in pixels of the user's camera.
         world_threshold: :math:`\omega` in the unit of the user's world.
-        scorer: ``"msac"`` (truncated squares), ``"inliers"`` (number of outliers), or a function (see
-            ``kornia_pnpnet.propose.scoring.Scorer``) that gives the loss of a pair.
+        scorer: loss of a pair, ``"msac"`` (truncated square), ``"inliers"`` (1 for outliers, 0 for inliers), or a
+            function (see ``kornia_pnpnet.propose.scoring.Scorer``).
         max_samples: largest number of samples of a problem.
         min_samples: smallest number of samples of a problem. Noise can make the pose of a single sample inaccurate.
         confidence: required probability that at least one sample has no outlier, in (0, 1).
@@ -144,8 +144,8 @@ class RANSAC(Initialiser):
             )
         if not compiling() and not all(map(sees_values, problem[:3])):
             raise NotImplementedError(
-                "RANSAC runs neither in torch.func.vmap nor on the device meta, because its search ends when its "
-                "problems are solved. In place of vmap, give the solver a larger batch with any leading dimensions."
+                "RANSAC runs neither in torch.func.vmap nor on the device meta, because the number of samples depends "
+                "on tensor values. Instead of vmap, give the solver a larger batch with any leading dimensions."
             )
         # If tensors are contiguous, the rounding of sums over pairs does not depend on the position in the batch.
         problem = problem._replace(noise=None).map(torch.Tensor.contiguous)
@@ -179,7 +179,7 @@ class RANSAC(Initialiser):
 
 
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
-    """Weights (B, N) of a Cauchy kernel. Thresholds are wide, so that the inliers' median residual gives the scale."""
+    """Weights (B, N) of a Cauchy kernel. The inliers' median residual gives the scale, because thresholds are wide."""
     there = inliers > 0
     sq_scale = cauchy_scale(errors, there).clamp(min=torch.finfo(errors.dtype).eps)
     # With few inliers, the median residual underestimates the noise. All weights are then closer to 1.
@@ -213,13 +213,12 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     Args:
         problem: normalised problems of a centred and scaled world.
         starts: several poses per problem, and the noise of the pairs. Weights are probabilities that pairs are inliers.
-        keep_others: whether the result keeps the other poses of the starts, because a search on few pairs can lead away
-            from the correct pose.
+        keep_others: whether to keep the other poses of the starts. The best pose of few pairs can be incorrect.
 
     Returns:
         First, the starts with the best pose, without gradient. In a searched problem, a Cauchy kernel at the best pose,
-        with the inlier threshold as its scale, gives the weights. Second, the best pose by a quarter of the thresholds,
-        a rival of the refined pose.
+        with the inlier threshold as its scale, gives the weights. Second, the pose with the least loss at a quarter of
+        the thresholds, for the comparison with the refined pose (`reconsider`).
 
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.
@@ -227,7 +226,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     constant = map_tensors(torch.Tensor.detach, starts)
     known, noise = problem.noise, constant.noise
     if noise is None or starts.others is None:
-        raise ValueCheckError('effort="adaptive" needs an initialiser with several poses and the noise, as SetInit.')
+        raise ValueCheckError('effort="adaptive" needs an initialiser of several poses and the noise, like SetInit.')
     problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
     depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)

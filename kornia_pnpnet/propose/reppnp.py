@@ -48,9 +48,9 @@ class REPPnP(Initialiser):
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
     Rejection", CVPR 2014. Our changes improve success or allow batches:
 
-    - The null vector is scaled so that the centroid has depth 1 (paper: length 1). It solves a linear system, and does
-      not depend on the control points, the frame or the unit. A small ridge pulls all points toward the depth of the
-      centroid, which reduces the effect of outliers.
+    - The null vector is scaled so that the centroid has depth 1 (paper: length 1). The vector solves a linear system,
+      and does not depend on the control points, the frame or the unit. A small ridge pulls all points toward the depth
+      of the centroid, which reduces the effect of outliers.
     - Outliers are rejected by their leave-one-out error. The quantile is 50 % (paper: 25 %).
     - A second loop rejects outliers of a rigid motion, fitted by Gauss-Newton to the algebraic error. The final pose
       minimises this error. The paper alternates between a combination of four null vectors and a rigid motion.

@@ -138,7 +138,7 @@ class Samples:
         self._upper = self._share.gather(1, self._order).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        """Positions (P, H, s) of pairs in samples ``start`` to ``stop - 1`` of problems (P,). Samples may repeat."""
+        """Positions (P, H, s) of pairs in samples ``start`` to ``stop - 1``. After the last sample, samples repeat."""
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
         if self._numbers is not None:
@@ -149,7 +149,7 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        The number of pairs becomes the inverse of the inliers' mean chance, where the chances also weight the mean.
+        Instead of the number of pairs, the inverse of the inliers' mean chance (weighted by the chances) is used.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
@@ -183,9 +183,9 @@ def _subsets(count: int, size: int, seed: int) -> Tensor:
 def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float) -> Tensor:
     r"""Number of samples needed for a probability ``confidence`` that at least one sample has no outlier, float64 (B,).
 
-    The number is :math:`\log(1-p) / \log(1-w)`, where :math:`w = \binom{k}{s} / \binom{c}{s}` is the share of samples
-    without an outlier for :math:`k` inliers of :math:`c` pairs, not necessarily integers (M. Fischler and R. Bolles,
-    "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B).
+    The number is :math:`\log(1-p) / \log(1-w)` for the confidence :math:`p`. The share of samples without an outlier is
+    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs, not necessarily integers
+    (M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B).
     """
     drawn = torch.arange(size, dtype=torch.float64, device=inliers.device)
     shares = (inliers[:, None] - drawn).clamp(min=0.0) / (counts[:, None] - drawn).clamp(min=1.0)

@@ -28,7 +28,7 @@ __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 #: Maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
-# For a point behind the camera, this number times the depth is added to the numerator, so that e exceeds MAX_ERROR.
+# For a point behind the camera, this number times |depth| is added to the numerator, so that e exceeds MAX_ERROR.
 _BEHIND = 1e15
 
 

@@ -58,8 +58,8 @@ _LIMITS = 3.0, 1.0
 # If `pose_sigma` exceeds _OPEN, an incorrect pose may have as many inliers as the correct pose, for example in a flat
 # scene and a narrow field of view. At least _OPEN_SAMPLES samples are then drawn.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
-# After this number of samples, the chance that a pair is drawn is multiplied by (a + agreement)^b. The samples take as
-# long as `agreement_of_neighbours`. The numbers a and b were chosen empirically.
+# After this number of samples, the chance that a pair is drawn is multiplied by (a + agreement)^b. The samples before
+# take as long as `agreement_of_neighbours`. The numbers a and b were chosen empirically.
 _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
@@ -94,7 +94,7 @@ class Search:
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
-        rivals: the best pose of each problem by a quarter of the thresholds, never improved, :math:`(B, 12)`.
+        rivals: the pose with the least loss at a quarter of the thresholds, before any improvement, :math:`(B, 12)`.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class Search:
     def _expect(self, at: Tensor) -> None:
         """Estimate how many samples some problems need, from the inliers of their best poses.
 
-        After `_prefer_agreement`, it is the geometric mean of the numbers for the old and for the new chances. On
+        After `_prefer_agreement`, the estimate is the geometric mean of the numbers for the old and the new chances. On
         repeated structure, neighbours of outliers agree. The number for the new chances could then end a search early.
         """
         if not len(at):
@@ -244,7 +244,7 @@ class Search:
         self.needed[at] = needed
 
     def _sizes_of_round(self, done: int) -> tuple[int, int]:
-        """Number of samples in the next round, and largest number of remaining samples that it draws instead."""
+        """Number of samples in the next round, and largest number of remaining samples that are drawn in one round."""
         size = min(max(self.plan.min_samples, int(_GROWTH * done)), _LARGEST_ROUND)
         most = max(_ROUNDS_LEFT * size, _FEW_SAMPLES if self.problem.free_focal is None else 0)
         return size, min(most, _LARGEST_ROUND)
@@ -264,7 +264,7 @@ class Search:
         of first pairs increases with ``start``, because after many samples without success inliers are rare.
         """
         poses, valid = self._solved(problems, self.samples.positions(problems, start, stop))
-        # Samples repeat after the last one of a problem. The best poses of a problem must not depend on its neighbours.
+        # After its last sample, a problem repeats samples. Its best poses must not depend on the rest of the batch.
         fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]
         valid = valid & fresh.repeat(1, valid.shape[1] // (stop - start))
         if valid.shape[1] * self.low.shape[1] > _FEW_RESIDUALS:

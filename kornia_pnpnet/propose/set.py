@@ -185,7 +185,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 
 
 def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
-    """For S minimal samples, the least numbers of pairs of problems that use them, and the 3 S ranks of their pairs."""
+    """The number of pairs from which a problem uses each of S samples, and the 3 S ranks of the samples' pairs."""
     every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if not search_follows:  # a search draws further samples
         every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
@@ -196,7 +196,7 @@ def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[in
 
 @cache
 def _sample_table(count: int, number: int, search_follows: bool, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Ranks (3 S,) and least numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
+    """Ranks (3 S,) and numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
 
     A CUDA graph cannot contain a copy from the CPU.
     """

@@ -1,4 +1,4 @@
-"""Views are mirror images of a problem. A network finds a different pose for each view."""
+"""Views are rotated or mirrored copies of a problem. A network finds a different pose for each view."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: boo
 
 
 def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
-    """Undo the signs and the exchange of a view in the x, y and z along ``axis``."""
+    """Undo the signs and the exchange of a view in the coordinates x, y and z along ``axis``."""
     x, y, z = entries.unbind(axis)
     x, y = _exchanged(x, y, False, *view[1:])
     return torch.stack((y, x, z) if view[0] else (x, y, z), axis)

@@ -1,9 +1,9 @@
 r"""Robust kernels, which weight a pair by its squared residual, and hyperparameters that are learned within bounds.
 
 A kernel is a loss :math:`\rho(s)` of the squared residual and its derivative :math:`w(s)`. The residual is in pixels of
-the normalised camera or, if the noise is known, in standard deviations. The *shape* of ``huber``, ``cauchy``,
-``geman_mcclure`` and ``truncated`` is a scale in the unit of the residual. The shape of ``power`` is the exponent
-:math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net. To add a kernel, add an entry to :data:`KERNELS`.
+the normalised camera or, if the noise is known or estimated, in standard deviations. The *shape* of ``huber``,
+``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the unit of the residual. The shape of ``power`` is the
+exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net. To add a kernel, extend :data:`KERNELS`.
 """
 
 from __future__ import annotations
@@ -126,8 +126,8 @@ class BoundedParameter(nn.Module):
         super().__init__()
         check_whole(1, size=size)
         check_numbers(-math.inf, lower=lower, upper=upper)
-        KORNIA_CHECK(lower < upper, f"The bounds must rise, got {lower} and {upper}.")
-        KORNIA_CHECK(not logarithmic or lower > 0, f"The bounds of a logarithm must be positive, got {lower}.")
+        KORNIA_CHECK(lower < upper, f"lower must be less than upper, got {lower} and {upper}.")
+        KORNIA_CHECK(not logarithmic or lower > 0, f"lower must be positive if logarithmic, got {lower}.")
         KORNIA_CHECK(lower <= initial <= upper, f"The initial value {initial} must lie between {lower} and {upper}.")
         self._logarithmic = logarithmic
         self._lower, self._upper = (math.log(lower), math.log(upper)) if logarithmic else (lower, upper)

@@ -61,10 +61,10 @@ class Plan(NamedTuple):
 
     Attributes:
         problem: the problem with the caller's weights. Its noise is known for every pair or ``None``.
-        prior: weight of each pair, in the cost and in ``judge``, before the robust weight. With iterations by residual,
-            the caller's weight, else the product of the caller's and the initialiser's weights.
+        prior: weight of each pair in ``judge``, before the robust weight. With iterations by residual (see
+            :class:`RobustWeightedLM`), the caller's weight, else the product of caller's and initialiser's weights.
         guided: the product of the caller's and the initialiser's weights, divided by the largest product.
-        by_residual: with iterations by residual, the caller's weights over their mean (without zeros), else ``guided``.
+        by_residual: with iterations by residual, ``prior`` divided by the mean positive weight, else ``guided``.
         state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second, ….
         world_sigma: the caller's standard deviation of each point, 0 where unknown.
         votes: see :class:`~kornia_pnpnet.judge.evidence.Votes`.
@@ -112,8 +112,8 @@ class Refinement(NamedTuple):
         state: the refined pose in the frame of the problem, and the refined camera.
         weights: the weight of each pair at the refined pose, shape :math:`(B, N)`.
         cost: robust loss of pairs and terms, divided by the number of pairs, shape :math:`(B,)`.
-        ok: whether the pose is to be believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
-        in_front: whether at least three pairs with a weight are in front of the camera, bool, shape :math:`(B,)`.
+        ok: whether the pose is believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
+        in_front: whether at least three pairs of positive weight are in front of the camera, bool, shape :math:`(B,)`.
         probability: see :func:`~kornia_pnpnet.judge.evidence.probability`, shape :math:`(B,)`.
         sigma: :func:`~kornia_pnpnet.judge.evidence.pose_sigma`, float64, shape :math:`(B,)`.
         evidence: the evidence for the pose.
@@ -139,8 +139,8 @@ class RobustWeightedLM(Configured):
 
     Each iteration takes one :func:`~kornia_pnpnet.refine.residual.lm_step`. The weight of a pair is the product of the
     caller's weight, the initialiser's weight, and the robust weight of the residual at the previous estimate. Step
-    :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel) are learned. A problem that cannot
-    be solved keeps its pose, and is not ``ok``.
+    :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel) are learned. A problem whose
+    equations cannot be solved keeps its pose, and is not ``ok``.
 
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
     pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is in standard deviations.
@@ -161,8 +161,8 @@ class RobustWeightedLM(Configured):
             squares.
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
-        reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. Without
-            rejection, iterations from a distant start can diverge.
+        reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10, except in
+            the last ``by_residual`` iterations. Without rejection, iterations from a distant start can diverge.
         by_residual: number of final iterations that ignore the initialiser's weights, at most the number of iterations
             after the choice among several poses.
         learnable: whether the hyperparameters are trained.
@@ -250,8 +250,8 @@ class RobustWeightedLM(Configured):
     def forward(self, problem: Problem, starts: Starts) -> Refinement:
         """Refine the poses of ``starts`` in the frame of the problem.
 
-        A pose is ``ok`` only if the equations of the last iteration could be solved, three pairs are in front of the
-        camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.evidence.believe`).
+        A pose is ``ok`` only if the equations of the last iteration could be solved, at least three pairs are in
+        front of the camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.evidence.believe`).
         """
         plan, now = self.iterate(self.begin(problem, starts))
         return self.judge(plan, now)
@@ -273,7 +273,7 @@ class RobustWeightedLM(Configured):
             mean = prior.sum(-1, keepdim=True) / (prior > 0).sum(-1, keepdim=True).clamp(min=1)
             by_residual = prior / torch.where(mean > 0, mean, 1.0)
         poses = starts.poses
-        # The memory layout of `problems_last` is (3, 3, S B) and (3, S B).
+        # In memory, rotations have the shape (3, 3, S B), and translations (3, S B), see `problems_last`.
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
         camera = pose.translation[:, : 0 if problem.free_focal is None else 1] * 0.0
         if starts.camera is not None:
@@ -319,7 +319,7 @@ class RobustWeightedLM(Configured):
     def by_residuals(self, plan: Plan, now: Progress, known: Tensor, step: Tensor, damping: Tensor) -> Progress:
         r"""One iteration by residual: fit the mixture to the residuals, and take a step with its weights.
 
-        The mixture of a problem that is ``known``, bool :math:`(B, 1)`, keeps its variance.
+        If the noise of a problem is ``known``, bool :math:`(B, 1)`, its mixture keeps the variance.
         """
         assert now.mixture is not None
         problem = plan.problem._replace(weights=plan.by_residual)
@@ -334,7 +334,7 @@ class RobustWeightedLM(Configured):
     def judge(self, plan: Plan, now: Progress, found: Evidence | None = None, odds: Tensor | None = None) -> Refinement:
         """Compute weights, cost, ``ok`` and, unless ``found`` is given, the evidence of the states of :meth:`iterate`.
 
-        ``odds`` are log-odds of the poses against their rivals, shape :math:`(B,)`; ``None``: no rivals.
+        ``odds`` are log-odds of the poses against other poses, shape :math:`(B,)`; ``None``: there are no other poses.
         """
         seen = at_pose(now.state, plan.problem, plan.votes)
         shape = per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
@@ -368,7 +368,7 @@ class RobustWeightedLM(Configured):
         other = (second > first + _EXPECTED).long()
         index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
         noise, mixture = taken((both, found.mixture), index)
-        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # same strides as after an iteration, to share a graph
+        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # strides as after an iteration, to share its graph
         return plan._replace(problem=plan.problem._replace(noise=noise)), now._replace(mixture=mixture)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
@@ -410,7 +410,7 @@ class RobustWeightedLM(Configured):
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
-        """Of the states of each problem in ``now``, keep the state with the lowest cost."""
+        """Keep the state of each problem with the lowest cost. ``rivals`` are the problems of all states in ``now``."""
         batch = prior.shape[0]
         projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
@@ -427,7 +427,7 @@ class RobustWeightedLM(Configured):
         sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
         count = (problem.weights > 0).sum(-1).clamp(min=1)
         total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
-        unit = problem.img_scale.square() if problem.noise is None else 1.0  # without noise, sigma is one pixel
+        unit = problem.img_scale.square() if problem.noise is None else 1.0  # without noise, sigma is a caller's pixel
         for term in problem.terms:
             total = total + unit * term.loss(projection.state)
         return total / count
@@ -437,8 +437,9 @@ class RobustWeightedLM(Configured):
 
         At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
         Each added Newton step has this gradient and the value 0. If the Newton matrix is not positive definite, the
-        Gauss-Newton matrix replaces it. The second step makes second derivatives exact. Covariances of points rotate
-        with the pose, so that the Newton matrix is not exactly symmetric. A third step removes most of this error.
+        Gauss-Newton matrix replaces it. The second step makes second derivatives exact. The solver assumes a symmetric
+        matrix. Covariances of points rotate with the pose, so that the Newton matrix is not exactly symmetric. A third
+        step removes most of the resulting error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
@@ -480,7 +481,7 @@ def taken(tree: _T, index: Tensor) -> _T:
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
     """The noise of every pair: sigmas of the initialiser, else of the caller, and the caller's covariances.
 
-    If the initialiser gave no noise, unknown sigmas become 0. ``None``: neither gave noise.
+    If the initialiser gave no noise, unknown sigmas become 0. Without any noise, the result is ``None``.
     """
     given = starts.noise if problem.noise is None else problem.noise
     if given is None:

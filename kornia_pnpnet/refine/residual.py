@@ -120,7 +120,7 @@ def project(state: State, problem: Problem) -> Projection:
         tensor([25., 50.])
     """
     rotation, world = state.pose.rotation, problem.world_points
-    if are_few(world):  # one call
+    if are_few(world):  # a single call is faster
         rotated = torch.bmm(rotation, world.mT).permute(1, 2, 0)
     else:
         rotated = small_product(rotation.permute(1, 2, 0), world.permute(2, 1, 0))  # (3, N, B)
@@ -210,8 +210,8 @@ def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tenso
     """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
 
     Without noise, squared residuals are in square pixels, and the information is 1, (1, 1). With noise, all sigmas must
-    be known. Squared residuals are then in variances of their pixel, and the information is the inverse variance of
-    each pixel, (B, N), or the inverse covariance if the noise has covariances.
+    be known. Squared residuals are then divided by the variance of their pixel, and the information is the inverse
+    variance of each pixel, (B, N), or the inverse covariance if the noise has covariances.
     """
     noise = problem.noise
     if noise is None:
@@ -232,7 +232,7 @@ def normal_equations(
         projection: the problem projected at the state.
         problem: the problem.
         weights: weight of each pair, :math:`(B, N)`, or its weight matrix, entries :math:`(B, N)`, in inverse square
-            pixels. Points behind the camera do not count.
+            pixels. Points behind the camera have no effect.
         relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
             underflow. The divisor has no gradient.
     """
@@ -307,7 +307,7 @@ def _entrywise_equations(
             return zero
         return total if products[0] is uu else products[0].sum(0)
 
-    # Columns 3 and 4 are (1, 0) and (0, 1). Their products with a weighted column are its u and v entries.
+    # In `_columns`, columns 3 and 4 can be constants. The inner product with a constant column is only a sum.
     size = range(len(columns))
     lower = {
         (i, j): inner(weighted[j], columns[i]) if i < 5 else inner(weighted[i], columns[j])
@@ -410,7 +410,7 @@ def moved(state: State, delta: Tensor) -> State:
         once = torch.linalg.cross(turn, rotation, dim=0)
         both = torch.add(once, torch.linalg.cross(turn, once, dim=0), alpha=0.5)
         rotation = torch.addcdiv(rotation, both, size, value=4.0)
-    else:  # entry by entry: compiled `linalg.cross` computes the vector and the factor again for each entry
+    else:  # entry by entry, because compiled `linalg.cross` computes `turn` and `size` again for each entry
         columns = [_cross([*turn[:, 0]], [*column]) for column in rotation.unbind(1)]
         twice = [_cross([*turn[:, 0]], column) for column in columns]
         sums = [[x + 0.5 * y for x, y in zip(*pair, strict=True)] for pair in zip(columns, twice, strict=True)]

@@ -25,7 +25,7 @@ __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 # An eigenvalue of a matrix with a unit diagonal counts as 0 if it is below this number. An eigenvalue of any other
 # information matrix counts as 0 if its ratio to the largest eigenvalue is below this number.
 _KNOWN = 1e-5
-# Squared errors are clipped at this number of squared scales of the robust kernel. Larger errors have about no weight.
+# Squared errors are clipped at this multiple of the squared scale of the robust kernel. There, the weight is about 0.
 _LARGEST_RATIO = 100.0
 # Default scale of the robust kernel, in standard deviations.
 _SCALE = 3.0
@@ -140,9 +140,9 @@ class PoseTerm(NamedTuple):
     Attributes:
         pose: the expected pose.
         information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
-        offset: the point of the caller's world that is the origin of the problem, in lengths of the problem, shape
+        offset: the point of the caller's world that is the origin of the problem, in the unit of the problem, shape
             :math:`(B, 3)`. Errors of the translation are measured at the origin of the caller's world.
-        free: the only axis in the camera about which the rotation is unknown, or 0, shape :math:`(B, 3)`.
+        free: the only axis in the camera frame about which the rotation is unknown, or 0, shape :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
         rank: number of directions in which the prior has information, shape :math:`(B,)`.
     """
