@@ -124,13 +124,13 @@ def main(config: DictConfig) -> float | None:
 
 
 def continuing(*more: str) -> str:
-    """The command that continues this run, or all runs of the sweep. A cluster's job does not know its command."""
+    """The command that continues this run or sweep. In a cluster's job, ``...`` stands for the unknown arguments."""
     words = sys.argv if Path(sys.argv[0]).name == Path(__file__).name else ["train.py", "-m", "..."]
     return shlex.join(["python", *words, *(word for word in more if word not in words)])
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:
-    """Copy the weights of another solver. If the refinements differ in kind, ``model`` keeps its refinement."""
+    """Copy the weights of another solver. If ``m`` or the form of the refinement differs, ``model`` keeps its own."""
     state = trained.state_dict()
     kind = {key: trained.refine.config[key] for key in ("m", "kernel", "shared", "by_residual")}
     if not kind.items() <= model.refine.config.items():

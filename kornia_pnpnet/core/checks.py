@@ -22,7 +22,7 @@ def _is_number(value: Any) -> bool:
 
 
 def check_whole(least: int, most: int | None = None, /, **values: Any) -> None:
-    """Raise ``BaseError`` unless each value is an integer (also NumPy's) from ``least`` to ``most``, if given."""
+    """Raise ``BaseError`` unless each value is a Python or NumPy integer in [least, most]. ``None`` means no limit."""
     bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     for name, value in values.items():
         whole = isinstance(value, Integral) and not isinstance(value, bool)
@@ -60,7 +60,7 @@ def check_tensors(tensors: Mapping[str, Any]) -> None:
 
 
 def check_form(form: list[str], **tensors: Tensor) -> None:
-    """Raise an error unless each value is a tensor of the shape ``form``, as ``KORNIA_CHECK_SHAPE`` defines it."""
+    """Raise an error unless each value is a tensor of the shape ``form``, in the notation of ``KORNIA_CHECK_SHAPE``."""
     check_tensors(tensors)
     for name, tensor in tensors.items():
         KORNIA_CHECK_SHAPE(tensor, form, f"Argument: {name}")

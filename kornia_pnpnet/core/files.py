@@ -82,8 +82,8 @@ def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] =
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Read the named arrays (or all arrays) of an NPZ file without unpickling. Missing arrays are left out.
 
-    Raise ``ValueError`` when the file is not an NPZ file of numbers, or when the arrays take more than
-    :data:`MOST_BYTES`. The message does not name the file.
+    Raise ``ValueError`` when the file is not an NPZ file, contains pickled objects, or has arrays of more than
+    :data:`MOST_BYTES` in total. The message does not name the file.
     """
     with path.open("rb") as file:
         try:

@@ -53,7 +53,7 @@ class _BoundedGradient(torch.autograd.Function):
 
 
 def bound_gradient(values: Tensor, limit: float) -> Tensor:
-    """Return values (B, *). Limit the norm of each problem's gradient, and set a gradient that is not finite to 0."""
+    """Return values (B, *) unchanged. Limit the norm of each problem's gradient, and set non-finite gradients to 0."""
     bounded: Tensor = _BoundedGradient.apply(values, limit)  # type: ignore[no-untyped-call]
     return bounded
 
@@ -77,7 +77,7 @@ def lengths(vectors: Tensor) -> Tensor:
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide values (B, N) by the largest positive ``size`` of their problem. The divisor has no gradient."""
+    """Divide values (B, N) by the largest ``size`` of their problem, if positive. The divisor has no gradient."""
     largest = size.detach().amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
@@ -138,9 +138,9 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
     # Because of this stack, a compiler computes both values once per matrix, not once per entry.
     largest, determinant = torch.stack((largest, determinant))
-    # `upright` is M plus its cofactors divided by s₁ (see `nearest_rotation`), and has the singular vectors of M. The
-    # singular values of `upright` are first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃ (twice). The Gram matrix has two
-    # eigenvalues, so that its inverse square root is a linear combination of the identity and the Gram matrix.
+    # `upright` is M + C / s₁ with the cofactors C of M; for s₁ see `nearest_rotation`. M and `upright` have the same
+    # singular vectors. The singular values of `upright` are first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃ (twice).
+    # The Gram matrix G has two distinct eigenvalues, so that its inverse square root is `constant` I + `linear` G.
     upright = scaled + cofactors / largest
     first = largest + determinant / (largest * largest)
     square = first * first
@@ -238,7 +238,7 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def span_a_plane(centred: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-    """Tell whether points span more than a line, bool (B,), and whether they do so beyond the rounding of coordinates.
+    """Tell whether points span more than a line, and whether by more than the rounding of coordinates, bool (B,) each.
 
     ``centred`` has points (3, N, B) minus their mean. The coordinates before centring are at most 1, and padding is 0.
     ``share`` (B,) is the inverse of the number of points.

@@ -1,4 +1,4 @@
-"""Code for speed, which does not change results. Times were measured with PyTorch 2.13 on one thread of an AMD EPYC."""
+"""Precision, compilation, memory layout, sorts. Times were measured with PyTorch 2.13 on one thread of an AMD EPYC."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def are_few(x: Tensor) -> bool:
 
 
 def problems_last(tree: _T) -> _T:
-    """Lay out tensors (B, N, C) as (C, N, B) in memory. Shapes and values do not change.
+    """Lay out tensors (B, N, C), except small ones, as (C, N, B) in memory. Shapes and values do not change.
 
     Elementwise operations then fill the vector registers of the CPU. With 9 pairs per problem, this layout halves the
     time of an iteration of the refinement.
@@ -111,7 +111,7 @@ def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
 
-# Largest mmap threshold of glibc in bytes, 32 MiB (mallopt(3), M_MMAP_THRESHOLD), minus the header of an allocation.
+# Largest mmap threshold of glibc, 32 MiB (mallopt(3), M_MMAP_THRESHOLD), minus a margin for the allocation's header.
 _LARGEST_KEPT = 2**25 - 2**16
 
 
@@ -122,7 +122,7 @@ def keep_freed_memory() -> None:
     ``pnpnet-set`` take 20 to 45 % longer. Only programs may call this function, because a library must not change the
     allocator of its process.
     """
-    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")  # freed at once; its pages are never written
+    torch.empty(_LARGEST_KEPT, dtype=torch.uint8, device="cpu")  # freeing this tensor raises glibc's thresholds
 
 
 # --- order ------------------------------------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ def _ascending(keys: Tensor) -> Tensor:
 
 
 def _order_by_counting(*keys: Tensor) -> Tensor:
-    """The stable ascending order by keys (N, *). The first key has priority. Count the entries before each entry."""
+    """Find the stable ascending order by keys (N, *), by counting the entries before each. The first key has priority."""
     first = keys[0]
     position = torch.arange(first.shape[0], device=first.device).view(-1, *(1,) * (first.ndim - 1))
     before = position < position[:, None]  # entry (i, j): whether entry j precedes entry i
@@ -241,12 +241,12 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
 
 # Smallest number of pairs at which the CPU compiler of PyTorch 2.13 must not choose the order of loops. A chosen order
 # can transpose blocks of 16 numbers, and results are then incorrect if a problem has more pairs than the batch has
-# problems. With fewer pairs the compiler chooses, because compiled code otherwise takes up to 50 % longer.
+# problems. Below 16 pairs the compiler chooses, because compiled code otherwise takes up to 50 % longer.
 _MANY_PAIRS = 16
 
 
 class Runner:
-    """Calls functions of batches, compiled at their first call or uncompiled.
+    """Calls functions of batches, either uncompiled or compiled at their first call.
 
     A function takes tensors and nested tuples of tensors. The first dimension of each non-scalar tensor is the batch.
     The batch size may change without a new compilation, except to or from 1. PyTorch compiles again when the number of
@@ -274,7 +274,7 @@ class Runner:
         many = first.ndim > 1 and first.shape[1] >= _MANY_PAIRS
         kind = name, first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
         if kind in self._seen:
-            with suppress(Exception):  # a filter may raise a warning as an error: try again below, without warnings
+            with suppress(Exception):  # a warnings filter may turn a warning into an error: run again below
                 return cast(_T, self._functions[name, many](*args))
         try:
             if (name, many) not in self._functions:

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from kornia_pnpnet.core.linalg import factorise
 
-# In units in the last place of the trace. An eigenvalue counts as negative only if it is below minus this bound.
+# Rounding error in units in the last place of the trace. An eigenvalue counts as negative only below minus this error.
 _ROUNDING = 16.0
-# In units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the determinant would
-# otherwise be smaller than its rounding error.
+# Least eigenvalue in units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the
+# determinant would otherwise be smaller than its rounding error.
 _LEAST = 64.0
 
 

@@ -22,7 +22,7 @@ class GradientWatch:
     def see(self, ok: Tensor, *inputs: Tensor | None) -> None:
         """Record ``ok`` of a batch, bool, of any shape, if any of the inputs requires a gradient."""
         learns = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
-        # A wrapped tensor must not outlive its transform. A CUDA graph cannot contain the reading of a value.
+        # A tensor of `torch.func` must not outlive its transform. Values cannot be read while a CUDA graph is captured.
         readable = sees_values(ok) and not torch._C._functorch.is_functorch_wrapped_tensor(ok)
         readable = readable and not (ok.is_cuda and torch.cuda.is_current_stream_capturing())
         if len(self._solved) == _CALLS or not (learns and readable and ok.numel()):

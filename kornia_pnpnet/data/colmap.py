@@ -25,8 +25,8 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
     """Load a scene from a COLMAP model, or from a file of unfiltered 2D-3D matches with the true poses.
 
     The model is in the folder ``path`` or in its sub-folder ``dslr_calibration_undistorted`` (ETH3D), ``sparse/0`` or
-    ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image observes a
-    point twice, the first pixel is used. Points behind the camera are dropped. All pairs of a model count as inliers.
+    ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image observes a point
+    twice, the first pixel is used. Points behind the camera and NaN pixels are dropped. All pairs count as inliers.
 
     A file of matches is an ``.npz`` file of V images. The file has the arrays ``names`` (V,), ``K`` (V, 3, 3),
     ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with width and height. All other names start with the index

@@ -72,7 +72,7 @@ class MixedProblems:
         count = len(self.sources)  # distinct indices, so that no two sources draw the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
-        KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must know covariances, or none of them.")
+        KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must give covariances, or none of them.")
         for name in ("img_sigma", "world_sigma", "confidence"):
             parts = _alike(parts, name)
         problems = map_tensors(lambda *x: torch.cat(x), *parts)

@@ -16,8 +16,8 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# Distance of a near outlier's pixel from its point's pixel, in standard deviations of the noise: the default range, and
-# the least values of the ends of `near_pixels`. A choice: the noise itself hardly exceeds 5 standard deviations.
+# Distance of a near outlier's pixel from its point's pixel, in standard deviations of the noise: `_NEAR` is the default
+# range, and `_LEAST_NEAR` has the least ends of `near_pixels`. A choice: noise hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
 # This number is added to n * max_ratio before rounding down. With 0.33 the result is then floor(n / 3) for n up to 15.
 _SLACK = 0.05
@@ -40,7 +40,7 @@ class OutlierMix:
     r"""Number and kinds of the outliers of random problems.
 
     The number of outliers is a uniform integer between two bounds, and the outliers are random pairs. Kinds are
-    assigned in the order structured, near, crowd, mismatch. Each share applies to the outliers that have no kind yet.
+    assigned in the order structured, near, crowd, mismatch or sensing. Each step skips outliers that have a kind.
 
     Args:
         max_ratio: largest share of outliers. The largest count is rounded down: 0.33 gives n // 3 for n up to 15.

@@ -50,13 +50,13 @@ _LEAST_FACING = 0.05
 _ROOM_SIDE = (2.0, 15.0)
 _ROOM_HEIGHT = (2.2, 5.0)
 _FURNITURE = 4  # pieces
-_NEAREST = 0.15  # smallest depth of furniture, divided by the depth of the wall behind. Closer furniture would hide it
+_NEAREST = 0.15  # smallest depth of furniture, divided by the depth of the surface behind. Closer hits are ignored
 _CAMERA_HEIGHT = (1.0, 3.0)  # above the street
 _STREET_SIDE = (2.5, 20.0)  # distance of the house fronts
 _STREET_END = (30.0, 200.0)  # distance of the end of the street
-_YAW = 15.0  # standard deviation in degrees
+_YAW = 15.0  # standard deviation of the camera's yaw, in degrees
 _NEARER = 0.3  # share of points on cars and trees
-_NOWHERE = 1e6  # height of an invisible ceiling
+_NOWHERE = 1e6  # height of a street's box, so large that no ray reaches the top
 # Largest field of view in degrees. A pinhole camera needs less than 180.
 _WIDEST = 170.0
 # Depth maps: standard deviation of each coordinate of a map camera about the query camera, relative to the mean

@@ -96,9 +96,9 @@ class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
     Each problem consists of ``n`` random points of a random image and their pixels. ``outliers`` changes the pixels of
-    some pairs: the pixel of a *mismatch* is the pixel of a spare point of the same image. All other inliers of the
-    image stay inliers. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points and poses
-    do not depend on ``outliers``.
+    some pairs: a *mismatch* gets the pixel of a spare point of the same image, and a *sensing* outlier gets a uniform
+    pixel. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points and poses do not depend
+    on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
     this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.

@@ -36,7 +36,7 @@ _MOST_NOISE = 10.0
 _TINY = 1e-9
 # Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87°.
 _LEAST_COSINE = 0.05
-# Half the side of the largest image without `half_image`, at a focal length of 1. Some points may lie outside.
+# Half the side of the largest image if `half_image` is `None`, at a focal length of 1. Some points may lie outside.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
 # Number of first pairs of a problem that are never copies. A choice: eight pairs can still determine a pose.
 _LEAST_ORIGINALS = 8
@@ -136,7 +136,7 @@ class SyntheticProblems(RandomProblems):
                 check_numbers(low if end else 0.0, high, **{name: end})
         KORNIA_CHECK(
             self.axis_ratio == 1.0 or self.known_noise in (0.0, 1.0),
-            f"Covariances are known for all problems or for none, got known_noise={self.known_noise}.",
+            f"known_noise must be 0 or 1 if axis_ratio is above 1, got known_noise={self.known_noise}.",
         )
 
     def _draw(self, generator: torch.Generator) -> Problems:
@@ -202,7 +202,7 @@ class SyntheticProblems(RandomProblems):
         is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
         other = (n * unit((size, n), generator)).long()
         index = torch.where(is_copy, other, torch.arange(n))
-        # With n = 3, poses and cameras are also indexed, but `index` is then 0, 1, 2: no pair is a copy.
+        # With n = 3, poses and cameras are also indexed, but do not change: the first 8 pairs are never copies.
         return problems.map(lambda x: x[torch.arange(size)[:, None], index] if x.shape[1:2] == (n,) else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
@@ -216,7 +216,7 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """Reorder points, (B, 2N, 3), so that pairs that are not ``displaced``, (B, N), get the points of a bunch."""
+        """Reorder points, (B, 2N, 3). All pairs get points of a bunch, except the outliers ``displaced``, (B, N)."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
         # The score of a point is the distance of its direction from the direction of the first point, plus blur.

@@ -68,7 +68,7 @@ class KnownInliersAndNoise(Configured):
         noise |= {name: sigma for name, sigma in self.config.items() if noise[name.replace("sigma", "cov")] is None}
         return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **noise)
 
-    @torch.no_grad()  # else the gradient of a NaN point would be NaN for all points
+    @torch.no_grad()  # else a NaN point would give its camera a NaN gradient
     def _inverse_variances(self, problems: Problems) -> Tensor:
         """The weight of each pair in 1/px², (B, N); 0 for outliers."""
         cam_points = problems.true_cam_points

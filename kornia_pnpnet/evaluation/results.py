@@ -98,8 +98,8 @@ def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
     if found:
         more = [f"and {len(found) - _SHOWN_DIFFERENCES} more"] if len(found) > _SHOWN_DIFFERENCES else []
         raise ValueError(
-            f"'{path}' holds another evaluation (commit {there['environment'].get('commit')}), which this one cannot "
-            f"continue: {'; '.join(found[:_SHOWN_DIFFERENCES] + more)}. Choose another file, or overwrite this one."
+            f"'{path}' holds another evaluation (commit {there['environment'].get('commit')}), which cannot be "
+            f"continued: {'; '.join(found[:_SHOWN_DIFFERENCES] + more)}. Choose another file, or overwrite this file."
         )
     return {**there, "solvers": fresh["solvers"], "data": fresh["data"]}
 

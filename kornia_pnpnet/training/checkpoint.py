@@ -90,7 +90,7 @@ class History:
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Raise ``TrainingError`` when the file is damaged or has another identity. The file may have fewer updates.
+    Raise ``TrainingError`` when the file is damaged or has another identity. Its setting ``updates`` may be smaller.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)

@@ -253,8 +253,8 @@ def fit(
                     _log.warning("update %s: loss or gradient not finite, step skipped (%s so far)", update, skipped)
                 if skipped > settings.max_skipped:
                     raise TrainingError(
-                        f"{skipped} steps had a loss or a gradient that is not finite, more than max_skipped = "
-                        f"{settings.max_skipped}, up to update {update}. Lower the learning rate or check the data."
+                        f"{skipped} steps up to update {update} had a loss or a gradient that is not finite, more than "
+                        f"max_skipped = {settings.max_skipped}. Lower the learning rate or check the data."
                     )
             else:
                 fabric_optimizer.step()
