@@ -20,7 +20,7 @@ import poselib
 import pycolmap
 import torch
 from contenders import random_cameras, relative_errors
-from harness import Row, pivot, share, target
+from harness import Row, pivot, share
 from torch import Tensor, nn
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, create_solver
@@ -275,45 +275,6 @@ def measure_rigs(count: int, sets: Sequence[tuple[int, float]] = RIG_SETS) -> li
     return rows
 
 
-def by_cell(rows: Sequence[Row], *keys: str) -> dict[tuple[Any, ...], dict[str, Row]]:
-    """Rows by these entries, then by solver."""
-    found: dict[tuple[Any, ...], dict[str, Row]] = {}
-    for one in rows:
-        found.setdefault(tuple(one[key] for key in keys), {})[one["solver"]] = one
-    return found
-
-
-def targets(results: Row) -> list[dict[str, Any]]:
-    """The targets beside the measurements."""
-    cells = by_cell(results["focal"], "n", "share")
-    twelve = [cell for (n, outliers), cell in cells.items() if n == 12 and outliers <= 0.5]
-    rigs = by_cell(results["rigs"], "cameras", "baseline", "n", "share").values()
-    cell = results["cell"][0]
-
-    def behind(cells: Any, *peers: str) -> float:
-        return max(100 * (max(c[x]["success"] for x in peers) - c["pnpnet-set"]["success"]) for c in cells)
-
-    def faster(cells: Any, peer: str) -> float:
-        return min(c[peer]["us"] / c["pnpnet-set"]["us"] for c in cells)
-
-    solvable = [c for c in cells.values() if c["oracle"]["success"] > 0]
-    slowest = max(c["pnpnet-set"]["us"] for c in twelve)
-    points: dict[str, Any] = {"unit": "points"}
-    times: dict[str, Any] = {"unit": "times as fast", "at_most": False}
-    worst, fewest = "in the worst cell", "`pnpnet-set`, n = 12, at most 50 % outliers"
-    return [
-        target(f"Unknown focal length: behind pycolmap {worst}", behind(cells.values(), "pycolmap"), 0.0, **points),
-        target(f"Behind the oracle {worst}", behind(solvable, "oracle"), 5.0, **points),
-        target(f"{fewest}: the slowest cell", slowest, 100.0, unit="µs"),
-        target(f"{fewest}: beside pycolmap, the smallest ratio", faster(twelve, "pycolmap"), 10.0, **times),
-        target("COLMAP's cell: recall", 100 * cell["success"], 100.0, unit="%", at_most=False),
-        target("COLMAP's cell: median rotation error", cell["median_rotation_deg"], 0.015, unit="degrees"),
-        target("COLMAP's cell: median focal error", 100 * cell["median_focal"], 0.034, unit="%"),
-        target(f"Rigs: behind the better of PoseLib and pycolmap {worst}", behind(rigs, *RIG_PEERS), 0.0, **points),
-        target("Rigs: beside PoseLib, the smallest ratio", faster(rigs, "PoseLib"), 5.0, **times),
-    ]
-
-
 def _solved(row: Row) -> str:
     """Success in per cent, and µs where they are measured."""
     return f"{100 * row['success']:.1f}" + ("" if row["us"] is None else f" · {row['us']:,.0f}")
@@ -327,7 +288,6 @@ def page(results: Row) -> str:
         "cameras.md.jinja",
         results=results,
         pairs=CELL,
-        targets=targets(results),
         focal=pivot(results["focal"], {"n": "{n}", "outliers": "{share:.0%}"}, BY_FOCAL, _solved),
         scenes=pivot(results["scenes"], scene_keys, BY_FOCAL, _solved),
         rigs=pivot(results["rigs"], rig_keys, ("pnpnet-set", "p3p-ransac:threshold=10", *RIG_PEERS), _solved),

@@ -95,12 +95,6 @@ def share(chosen: Tensor) -> float | None:
     return float(chosen.double().mean()) if len(chosen) else None
 
 
-def target(what: str, measured: float, wanted: float, *, unit: str = "", at_most: bool = True) -> dict[str, Any]:
-    """A target beside the measurement, and whether the target is met."""
-    met = measured <= wanted if at_most else measured >= wanted
-    return {"what": what, "measured": measured, "target": wanted, "unit": unit, "at_most": at_most, "met": met}
-
-
 def parser(description: str | None, out: Path | None = None, *, required: bool = True) -> argparse.ArgumentParser:
     """A command line with ``--out``, whose help shows the description as it is written."""
     command = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -120,10 +114,10 @@ def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
 
 
 def render(template: str, **facts: Any) -> str:
-    """A page from its template, with the filters ``percent`` and ``digits``; a fact that is missing is an error."""
+    """A page from its template, with the filters ``percent``, ``digits`` and ``foot``; a fact that is missing is an error."""
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
-    environment.filters |= {"percent": percent, "digits": three_digits}
+    environment.filters |= {"percent": percent, "digits": three_digits, "foot": foot}
     return environment.get_template(template).render(**facts)
 
 
@@ -157,6 +151,12 @@ def pivot(
         lines.setdefault(tuple(x.format_map(row) for x in keys.values()), {})[row[by]] = cell(row)
     cells = [[*place, *(line.get(name, "–") for name in names)] for place, line in lines.items()]
     return markdown_table([*keys, *names], cells, **options)
+
+
+def foot(made: Row) -> str:
+    """Date, commit and processor of a measurement, from its ``environment``."""
+    commit = (made["commit"] or "unknown").partition("+")
+    return f"{made['date'][:10]}, commit {commit[0][:9]}{' with changes' * bool(commit[1])}, {made['cpu']}"
 
 
 def percent(value: float | None, digits: int = 1) -> str:

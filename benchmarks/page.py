@@ -154,7 +154,6 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         pays=compiling_pays(alone, many, settings["problems"], first_calls),
         libraries=[*filter(is_whole, alone), *(peer for peer in PEERS if peer in alone)],
         leaders=leaders(alone, many),
-        targets=[entry for part in PARTS for entry in results[part]["targets"]],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         memory=memory(starts),
         gpu=gpu_section(gpu),

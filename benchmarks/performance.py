@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import page
 import torch
-from contenders import ANY, PLAIN, TRAINED, WHOLE, CannotBeTimedError, Contender, N, Task, draw, make_contenders
-from harness import BACKWARD, FORWARD, HERE, Row, in_turns, ratio, recorded, run_child, say, summary, target, threads
+from contenders import PLAIN, TRAINED, WHOLE, CannotBeTimedError, Contender, N, Task, draw, make_contenders
+from harness import BACKWARD, FORWARD, HERE, in_turns, recorded, run_child, say, summary, threads
 from page import CACHED, COLD, EAGER
 
 from kornia_pnpnet.core.trees import take
@@ -205,7 +205,7 @@ def measure_threads(part: str, settings: Settings, count: int) -> dict[str, list
 
 
 def measure_part(part: str, settings: Settings) -> dict[str, Any]:
-    """Measure throughput, latency or cold starts; rows, skipped contenders and targets."""
+    """Measure throughput, latency or cold starts; rows and skipped contenders."""
     if part == "startup":
         return measure_startup(settings)
     # One process for each number of threads: code is compiled for the threads of its process.
@@ -214,9 +214,7 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
         run_child(Path(__file__), "--child", json.dumps(request), OMP_NUM_THREADS=str(request["count"]))
         for request in requests
     ]
-    found = {key: [entry for answer in answers for entry in answer[key]] for key in ("rows", "skipped")}
-    targets = throughput_targets if part == "throughput" else latency_targets
-    return {**found, "targets": targets(found["rows"])}
+    return {key: [entry for answer in answers for entry in answer[key]] for key in ("rows", "skipped")}
 
 
 # The first batch size shows the compiler's warm-up, the others whether another size compiles again.
@@ -246,7 +244,7 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
     imports = [
         float(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(_IMPORTS)
     ]
-    return {"starts": starts, "imports_s": imports, "skipped": skipped, "targets": startup_targets(starts, imports)}
+    return {"starts": starts, "imports_s": imports, "skipped": skipped}
 
 
 def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:
@@ -262,47 +260,6 @@ def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]
     batches = [min(size, settings.problems) for size in _BATCHES]
     with tempfile.TemporaryDirectory(prefix="inductor-") as folder:
         return [measured(cache, batches, TORCHINDUCTOR_CACHE_DIR=folder) for cache in (COLD, CACHED)]
-
-
-def throughput_targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Targets of 1000 problems of 9 pairs with 3 mismatches on one thread, where both sides were measured."""
-    here = page.matching(rows, threads=1, n=N, batch=1000, mode=FORWARD)
-    found = []
-    for name, most in (("refinement compiled", 3.0), (f"{TRAINED} compiled", 8.0)):
-        if name in here:
-            found.append(target(f"`{name}`, per problem", here[name]["median_us"], most, unit="µs"))
-    for solver, peer, least in ((TRAINED, "opencv-ransac", 20.0), (TRAINED, "poselib", 10.0), (ANY, "poselib", 5.0)):
-        mine = f"{solver} compiled"
-        if mine in here and peer in here:
-            what = f"`{mine}` against `{peer}`, {FORWARD}"
-            found.append(target(what, ratio(here[mine], here[peer]), least, unit="times as fast", at_most=False))
-    return found
-
-
-def latency_targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Targets of one problem on one thread."""
-    found = []
-    alone = page.matching(rows, threads=1)
-    for name, most_ms in {WHOLE: 0.4, f"{TRAINED} compiled": 0.4, PLAIN: 3.0, TRAINED: 3.0}.items():
-        if row := alone.get(name):
-            found.append(target(f"`{name}`, one problem, median", row["median_us"] / 1e3, most_ms, unit="ms"))
-            tail = f"`{name}`, one problem, 99th percentile by the median"
-            found.append(target(tail, row["p99_us"] / row["median_us"], 2.0))
-    return found
-
-
-def startup_targets(starts: Sequence[Row], imports: Sequence[float]) -> list[dict[str, Any]]:
-    """Most seconds of the import, and of making a compiled solver with its first call."""
-    what = "`import kornia_pnpnet` after torch and kornia"
-    found = [target(what, statistics.median(imports), 0.5, unit="s")] if imports else []
-    compiled = [entry for entry in starts if entry["contender"] == COMPILED]
-    if any("compil" in text for entry in compiled for text in entry["warnings"]):
-        return found  # there is no compiler
-    for entry in sorted(compiled, key=lambda entry: (entry["backward"], entry["cache"] == CACHED)):
-        most, mode = 20.0 if entry["cache"] == COLD else 5.0, BACKWARD if entry["backward"] else FORWARD
-        what, first = f"`{COMPILED}`, first call, {mode}, {entry['cache']}", entry["calls"][0]["first_s"]
-        found.append(target(what, entry["make_s"] + first, most, unit="s"))
-    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -13,6 +13,10 @@ from typing import Any
 
 import torch
 
+#: Number of changes of the poses, ``ok`` or ``probability`` that solvers return. Raise the number with each such change, so
+#: that a test can find results files that are too old. Files without a number were measured before the first change.
+BEHAVIOUR = 1
+
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
 # Distributions of OpenCV on PyPI, the most common distribution first.
 _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
@@ -23,8 +27,8 @@ def environment() -> dict[str, Any]:
 
     Returns:
         ``versions`` by package (``None`` if not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
-        ``gpu`` (``None`` without a GPU), ``date`` in UTC, and the git ``commit`` of the package (``None`` outside a
-        checkout). The commit ends with ``+`` if tracked files have changes.
+        ``gpu`` (``None`` without a GPU), ``date`` in UTC, :data:`BEHAVIOUR`, and the git ``commit`` of the package
+        (``None`` outside a checkout). The commit ends with ``+`` if tracked files have changes.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},
@@ -33,6 +37,7 @@ def environment() -> dict[str, Any]:
         "cpu": _cpu_name(),
         "threads": torch.get_num_threads(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "behaviour": BEHAVIOUR,
         "commit": _commit(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
