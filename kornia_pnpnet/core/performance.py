@@ -190,7 +190,7 @@ def _ascending(keys: Tensor) -> Tensor:
 
 
 def _order_by_counting(*keys: Tensor) -> Tensor:
-    """Find the stable ascending order by keys (N, *), by counting the entries before each. The first key has priority."""
+    """Find the stable ascending order by keys (N, *): count the entries before each. The first key has priority."""
     first = keys[0]
     position = torch.arange(first.shape[0], device=first.device).view(-1, *(1,) * (first.ndim - 1))
     before = position < position[:, None]  # entry (i, j): whether entry j precedes entry i
@@ -239,9 +239,9 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
 
 # --- compilation ------------------------------------------------------------------------------------------------------
 
-# Smallest number of pairs at which the CPU compiler of PyTorch 2.13 must not choose the order of loops. A chosen order
-# can transpose blocks of 16 numbers, and results are then incorrect if a problem has more pairs than the batch has
-# problems. Below 16 pairs the compiler chooses, because compiled code otherwise takes up to 50 % longer.
+# Smallest number of pairs at which the CPU compiler of PyTorch 2.13 must not choose the order of loops. With the chosen
+# order, compiled code may transpose blocks of 16 numbers. Results are then incorrect if a problem has more pairs than
+# the batch has problems. Below this number the compiler chooses, because code otherwise takes up to 50 % longer.
 _MANY_PAIRS = 16
 
 
@@ -298,7 +298,7 @@ class Runner:
     def _compile(self, function: Callable[..., Any], many: bool) -> Callable[..., Any]:
         options = torch._inductor.list_mode_options(self.mode or "default") | {
             "cpp.vec_isa_ok": True,  # skip tests of instruction sets, which take half of the first compilation
-            "cpp.enable_loop_tail_vec": False,  # compilation takes a third less time, calls the same time
+            "cpp.enable_loop_tail_vec": False,  # shortens the compilation by a third, but not the calls
             "guard_filter_fn": _needed_guards,
             **({"pick_loop_orders": False} if many else {}),
         }

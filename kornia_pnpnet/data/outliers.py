@@ -57,8 +57,8 @@ class OutlierMix:
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
         structured_ratio: range from which each problem draws its ratio of structured outliers to inliers uniformly.
-        structured_angle: largest rotation angle in radians. The pixels of structured outliers show a rotated and
-            shifted copy of the problem's points.
+        structured_angle: largest angle, in radians, by which the points are rotated. The pixels of structured outliers
+            show a rotated and shifted copy of the problem's points.
         mirrored_share: probability that the copy of a problem's points is also mirrored.
         crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
             leader. For each problem, the probability that an outlier joins a crowd is drawn uniformly from 0 to 1.

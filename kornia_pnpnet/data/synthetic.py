@@ -1,4 +1,4 @@
-"""Synthetic problems with noise and outliers, of the protocol and of cameras or rigs with random fields of view."""
+"""Synthetic problems with noise and outliers: the protocol's problems, and problems with random fields of view."""
 
 from __future__ import annotations
 
