@@ -13,8 +13,8 @@ from typing import Any
 
 import torch
 
-#: Number of changes of the poses, ``ok`` or ``probability`` that solvers return. Raise the number with each such change, so
-#: that a test can find results files that are too old. Files without a number were measured before the first change.
+#: Number of changes of the poses, ``ok`` or ``probability`` that solvers return. Raise the number with each such change,
+#: so that a test can find results files that are too old. Files without a number were measured before the first change.
 BEHAVIOUR = 1
 
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
