@@ -187,7 +187,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     check_form(["*", "3"], rays=rays)
     rays = rays.to(common_dtype({"rays": rays}))
     largest = rays.detach().abs().amax(-1, keepdim=True)  # in this unit, squares cannot overflow
-    # The gradient of a shorter direction would overflow.
+    # The gradient of a direction with smaller entries than this limit would overflow.
     sound = (largest > torch.finfo(rays.dtype).tiny ** 0.5) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
     rays = normalize(torch.where(sound, rays, axis) / torch.where(sound, largest, 1.0), dim=-1)

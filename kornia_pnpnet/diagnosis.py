@@ -38,7 +38,7 @@ class Diagnosis(NamedTuple):
     """The result of :func:`diagnose`. Its ``str`` is one sentence."""
 
     trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
-    #: The trials that are ``ok`` and equally good; a single trial if no change, or a change of the pose, suffices.
+    #: The trials that are ``ok`` and equally good. The input as given, or with another pose, excludes other trials.
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:

@@ -71,7 +71,7 @@ def control_points(problem: Problem) -> ControlPoints:
     world = problem.world_points.permute(2, 1, 0).contiguous()  # (3, N, B)
     centroid = (world * weights).sum(1)  # (3, B)
     rest = world - centroid[:, None]
-    # A variance below the limit counts as 0. After the first step, the limit is relative to the previous variance.
+    # A variance below the limit counts as 0. From the second axis on, the limit is relative to the previous variance.
     limit = torch.full_like(total, torch.finfo(rest.dtype).tiny ** 0.5)
     line_ratio = torch.finfo(rest.dtype).eps ** 0.5
     vectors, axes, found = [centroid], [torch.ones_like(weights)], []

@@ -26,7 +26,8 @@ __all__ = ["as_dist", "distorted", "find_focal", "scale_focal", "with_found_foca
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
-# Half the width of a square, divided by the median distance (maximum norm) of uniformly random points from the centre.
+# Ratio that estimates half the width of the image from the median distance (maximum norm) of pixels from its centre, if
+# the pixels are uniformly distributed in a square.
 _HALF_WIDTH = math.sqrt(2.0)
 # Half the range of log f in standard deviations, if the caller expects a focal length.
 _SEARCHED = 2.0

@@ -226,9 +226,9 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 
 
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Unit vectors along base and height of a triangle, 1 / base, the side's component along the base, and height².
+    """For triangles given by a base and another side, both (3, *, C), compute lengths and directions.
 
-    The triangle is given by its base and another side, both (3, *, C).
+    Returns unit vectors along base and height, 1 / base, the component of the side along the base, and height².
     """
     tiny = torch.finfo(base.dtype).tiny
     inv_base = _dot(base, base).clamp_(min=tiny).rsqrt_()

@@ -148,7 +148,7 @@ class REPPnP(Initialiser):
             errors = _leave_one_out(torch.cat((rows[:, :-1], null.mT @ rows), 1), inverse, pairs, weights)
             sq_size = null[:, 2:-1].square().sum(1).clamp(min=torch.finfo(null.dtype).eps ** 2)
             weights = self._keep(pairs, errors / sq_size, _NULL_FLOOR)
-        # Align the last null vector with the world.
+        # Find the pose that maps the world's points to the points in the camera that the last null vector describes.
         _, null = _null_vector(rows, weights, _FINAL_DEPTH_PRIOR)
         centroid, vectors = torch.cat((null[:, :2], null[:, -1:]), 1), null[:, 2:-1].view(-1, 3, 3)
         camera = torch.cat((centroid, vectors), 2)  # (B, 3, 4)

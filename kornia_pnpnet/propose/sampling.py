@@ -27,7 +27,7 @@ _GOLDEN = 0.6180339887
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
-    """Size of a block that is computed at once: ``count`` on a CPU (limited by a core's caches), else 64 ``count``."""
+    """Number of items that are computed at once: ``count`` on a CPU, whose caches limit it, and else 64 ``count``."""
     return count if like.device.type == "cpu" else 64 * count
 
 
@@ -149,7 +149,7 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        Instead of the number of pairs, the inverse of the inliers' mean chance (weighted by the chances) is used.
+        Unequal chances count as n equal chances, where 1 / n is the mean chance of an inlier, weighted by the chances.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)

@@ -31,7 +31,7 @@ CAUCHY = 3.4
 _DTYPE = torch.float32
 # Largest number of samples that a CPU solves and scores at once, so that the tensors fit into a core's caches.
 _SAMPLES_AT_ONCE = 8192
-# Number of samples in a round, divided by the number of earlier samples, and largest number of samples in a round.
+# A round has _GROWTH times as many samples as all earlier rounds together, at most _LARGEST_ROUND.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
 # A round draws all remaining samples if they are at most _FEW_SAMPLES, or fill at most _ROUNDS_LEFT rounds.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
