@@ -354,7 +354,7 @@ class RobustWeightedLM(Configured):
         return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
-        """Fit a mixture of inliers and outliers to the residuals, and set estimated noise of points to 0 if likelier."""
+        """Fit a mixture of inliers and outliers to the residuals, and set estimated noise of points to 0 if better."""
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
