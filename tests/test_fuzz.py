@@ -44,7 +44,7 @@ FAILED += (1795743997953, 1795743998144, 1795744001043, 1795745909057, 179574699
 FAILED += (1795754872328, 1795754880484, 1795754881312, 1795754882339, 1795754886535, 1795754887969, 1795754892234)
 FAILED += (1795749698028, 1795749698789, 1795749703647, 1795751187883, 1795760977342, 1795761542173, 1795765702655)
 FAILED += (1795765708321, 1795768394299, 1795771227441, 1795775363272, 1795775370187)
-FAILED += (1795780181006, 1795780182226, 1795780730356)
+FAILED += (1795780181006, 1795780182226, 1795780730356, 1795782447807)
 OURS = [x for x in k.list_solvers() if x.startswith(("pnpnet", "net", "epnp", "reppnp", "p3p", "ransac", "identity"))]
 PAIRS = {"p3p": 3} | {x: int(x.split("-")[1][1:]) for x in OURS if "net-n" in x}
 PROBLEM, NOISE = "world_points img_points intrinsics", "img_sigma img_cov world_sigma world_cov"
@@ -488,7 +488,7 @@ def check(call: Call, seed: int, law: str = "") -> None:
     if error is not None:
         refused = not call.wrong and is_refused(call)
         assert refused or call.wrong, f"refused: {error}"
-        names = {*call.args, "pairs", "pose", "error", *["rig", "focal"] * refused}
+        names = {*call.args, *call.args.get("options", {}), "pairs", "pose", "error", *["rig"] * refused}
         assert any(x in str(error).lower() for x in names), f"no argument is named: {error}"
         ours = "kornia" in traceback.extract_tb(error.__traceback__)[-1].filename
         assert isinstance(error, BaseError) or ours, f"not ours: {error}"
