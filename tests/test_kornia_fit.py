@@ -11,7 +11,6 @@ from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.linalg import inverse_transformation, transform_points
 
 from kornia_pnpnet import PnPNet, Pose, create_solver, pose_covariance, solve_pnp
-from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine.residual import project
 
@@ -104,15 +103,6 @@ def test_one_camera_serves_three_problems(make_problems):
     assert solver(*p[:2], cameras(p.intrinsics[:1])).matrix.equal(solver(*p[:2], p.intrinsics[0]).matrix)
     with pytest.raises(ShapeError, match="intrinsics"):
         solver(*p[:2], cameras(p.intrinsics[:2]))
-
-
-def test_cameras_of_bearings_keep_the_leading_dimensions(make_problems):
-    p = make_problems(n=9, batch=6)
-    rays = bearings(p.img_points, p.intrinsics)
-    world, rays, matrices = (x.unflatten(0, (2, 3)) for x in (p.world_points, rays, p.intrinsics))
-    result = create_solver("epnp-lm")(world, rays, cameras(p.intrinsics))
-    torch.testing.assert_close(result.intrinsics, matrices)
-    assert result.matrix.equal(create_solver("epnp-lm")(world, rays, matrices).matrix)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -48,21 +48,6 @@ def test_gradients_of_heat_maps(generator):
     assert gradcheck(heatmap_keypoints, (heatmaps, temperature))
 
 
-def test_a_map_with_nan_spoils_its_own_problem_only(make_problems, generator):
-    """Also its gradient."""
-    p = make_problems(n=12, batch=2, noise=False)
-    heatmaps = torch.randn(2, 12, 8, 8, generator=generator, dtype=DOUBLE)
-    heatmaps[1, 3, 0, 0] = torch.nan
-    heatmaps.requires_grad_()
-    offset, covariance = heatmap_keypoints(heatmaps)
-    pixels = p.img_points + 0.1 * (offset - 3.5)
-    result = create_solver("epnp-lm")(p.world_points, pixels, p.intrinsics, img_cov=covariance)
-    assert result.ok.tolist() == [True, False]
-    result.translation.sum().backward()
-    assert heatmaps.grad[0].isfinite().all()
-    assert heatmaps.grad[0].any()
-
-
 @pytest.fixture
 def seen(random_rotations, generator):
     """Points, the pose of a camera, and their pixels and depth in it."""

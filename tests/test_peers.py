@@ -115,21 +115,6 @@ def test_rubbish_of_any_size_neither_raises_nor_comes_back_infinite(name, genera
     assert 0 < result.ok.sum() < 48
 
 
-@pytest.mark.parametrize("name", PEERS)
-def test_absent_pairs_do_not_matter(name, make_problems):
-    solver = make(name)
-    problems = make_problems(n=12, batch=5)
-    first = problems._replace(world_points=problems.world_points[:, :9], img_points=problems.img_points[:, :9])
-    expected = solve(solver, first)
-    absent = torch.arange(12).expand(5, 12) >= 9
-    spoilt = problems._replace(world_points=problems.world_points.masked_fill(absent[..., None], torch.nan))
-    masked = solve(solver, spoilt, mask=~absent)
-    weighted = solve(solver, problems, weights=torch.where(absent, 0.0, 0.3).double())
-    for result in (masked, weighted):
-        assert (result.weights[absent] == 0).all()
-        assert_same(result._replace(weights=result.weights[:, :9], inliers=result.inliers[:, :9]), expected)
-
-
 def test_too_few_pairs_bad_weights_and_a_skew_fail_without_an_error(make_problems):
     skewed = make_problems(batch=4).map(torch.clone)
     skewed.intrinsics[2, 0, 1] = 5.0

@@ -9,9 +9,8 @@ import sys
 import pytest
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from torch import nn
 
-from kornia_pnpnet import MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.propose.mlp import rotation_about
@@ -135,23 +134,6 @@ def test_padding_changes_nothing_where_the_network_sees_some_pairs(make_problems
 
 
 # --- the paper's network ----------------------------------------------------------------------------------------------
-
-
-def sizes(module):
-    return [(layer.in_features, layer.out_features) for layer in module if isinstance(layer, nn.Linear)]
-
-
-@pytest.mark.parametrize("n", [6, 12])
-def test_layers_are_the_papers(n):
-    net = MLPInit(n)
-    assert sizes(net.shared) == [(5 * n, 20 * n), (20 * n, 5 * n), (5 * n, 3 * n)]
-    branch = [(3 * n, 2 * n)] + 4 * [(2 * n, 2 * n)]
-    assert sizes(net.rotation) == [*branch, (2 * n, 4)]
-    assert sizes(net.translation) == [*branch, (2 * n, 3)]
-    # A ReLU after each layer, except the last layer of a branch.
-    for module, is_branch in ((net.shared, False), (net.rotation, True), (net.translation, True)):
-        assert [type(layer) for layer in module] == (len(sizes(module)) * [nn.Linear, nn.ReLU])[: len(module)]
-        assert isinstance(module[-1], nn.Linear) == is_branch
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
