@@ -115,13 +115,11 @@ def test_rubbish_of_any_size_neither_raises_nor_comes_back_infinite(name, genera
     assert 0 < result.ok.sum() < 48
 
 
-def test_too_few_pairs_bad_weights_and_a_skew_fail_without_an_error(make_problems):
+def test_too_few_pairs_and_a_skew_fail_without_an_error(make_problems):
     skewed = make_problems(batch=4).map(torch.clone)
     skewed.intrinsics[2, 0, 1] = 5.0
     assert solve(OpenCVRansac(), skewed).ok.tolist() == [True, True, False, True]
     assert not solve(OpenCVRansac(), make_problems(n=3, batch=4)).ok.any()
-    weights = torch.tensor([-1.0, torch.nan, 1.0]).double()[:, None].expand(3, 9)
-    assert solve(OpenCVRansac(), make_problems(batch=3), weights=weights).ok.tolist() == [False, False, True]
 
 
 FEW = {"min_iterations": 2, "max_iterations": 4}

@@ -1,7 +1,6 @@
 """The shipped weights: the success they must reach, and model cards made from the results of their run."""
 
 import math
-import os
 import shutil
 
 import pytest
@@ -12,7 +11,7 @@ from kornia.core.exceptions import ValueCheckError
 from kornia_pnpnet import PnPNet, create_solver, shipped_weights
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import reliability
-from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, find_weights, read_weights, write_weights
+from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, read_weights, write_weights
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.results import load_run
 
@@ -79,7 +78,7 @@ def test_weights_of_the_set_network_are_inlier_probabilities():
 
 
 @pytest.mark.parametrize("name", shipped_weights())
-def test_model_card_is_generated_from_the_run(name, tmp_path):
+def test_shipped_weights_have_a_checksum_and_the_card_of_their_run(name, tmp_path):
     folder = WEIGHTS_FOLDER / name
     results = load_run(folder / "results.json")
     write_model_card(tmp_path, results, name=name)
@@ -91,19 +90,12 @@ def test_model_card_is_generated_from_the_run(name, tmp_path):
     updates = sum(run.run.update for run in results.lineage())
     assert updates >= (40_000 if name == "pnpnet-set" else 200_000)
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
-
-
-@pytest.mark.parametrize("name", shipped_weights())
-def test_shipped_weights_have_a_checksum(name, tmp_path):
-    folder = tmp_path / name
-    shutil.copytree(find_weights(name), folder)
-    PnPNet.from_pretrained(folder)
-    path = folder / "model.safetensors"
-    content = bytearray(path.read_bytes())
+    content = bytearray((folder / "model.safetensors").read_bytes())
     content[-5] ^= 1
-    path.write_bytes(content)
+    shutil.copy(folder / "config.json", tmp_path)
+    (tmp_path / "model.safetensors").write_bytes(content)
     with pytest.raises(ValueCheckError, match="damaged"):
-        PnPNet.from_pretrained(folder)
+        PnPNet.from_pretrained(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -119,17 +111,4 @@ def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, 
         PnPNet.from_pretrained(tmp_path)
     write_weights(tmp_path, config, {**state, "pair.bias": torch.full((4,), torch.nan)})
     with pytest.raises(ValueCheckError, match=r"not finite: pair\.bias"):
-        PnPNet.from_pretrained(tmp_path)
-
-
-def test_configurations_that_are_no_small_files_are_refused(tmp_path):
-    shutil.copytree(find_weights("pnpnet-n9"), tmp_path, dirs_exist_ok=True)
-    config = tmp_path / "config.json"
-    for content in ("[" * 100_000, " " * 2**21, '{"init": []}'):
-        config.write_text(content)
-        with pytest.raises(ValueCheckError):
-            PnPNet.from_pretrained(tmp_path)
-    (tmp_path / "model.safetensors").unlink()
-    os.mkfifo(tmp_path / "model.safetensors")
-    with pytest.raises(ValueCheckError):
         PnPNet.from_pretrained(tmp_path)

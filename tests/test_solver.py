@@ -1,5 +1,7 @@
 """What the laws of ``laws.py`` do not say of solvers: effort, confidence, gradients, given poses, saving and views."""
 
+import os
+
 import pytest
 import torch
 from helpers import assert_same, rate
@@ -311,7 +313,8 @@ DAMAGES = [
     lambda config, weights: torch.save({"a": torch.zeros(1)}, weights),
     lambda config, weights: weights.unlink(),
     lambda config, weights: save_file({"linear.weight": torch.zeros(2, 2)}, weights),
-    lambda config, weights: config.write_text("[1, 2]"),
+    lambda config, weights: weights.unlink() or os.mkfifo(weights),
+    *(lambda config, _, text=x: config.write_text(text) for x in ("[1, 2]", '{"init": []}', "[" * 10**5, " " * 2**21)),
     lambda config, weights: config.write_text(config.read_text().replace("cauchy", "huber")),  # of other weights
 ]
 
