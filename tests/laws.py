@@ -528,6 +528,7 @@ def wrong_arguments_are_refused(case: Case) -> None:
 
 #: Laws about problems that are ``ok``. The first guess of a network is not.
 OF_BELIEVED = (batches_are_free, shuffled_is_ordered, units_are_free, frames_are_free)
+NOT_OF_PEERS = (shuffled_is_ordered, units_are_free, frames_are_free, gradients_reach_the_inputs, copies_are_the_same)
 LAWS = (
     sound,
     batches_are_free,
@@ -555,16 +556,7 @@ def applies(law: Callable[[Case], None], case: Case) -> bool:
     if law is isotropic_covariances_are_sigmas:
         return case.noise == "sigma"
     if case.solver in PEERS:
-        return law in (
-            sound,
-            batches_are_free,
-            padding_is_nothing,
-            reflections_are_free,
-            bad_problems_fail_alone,
-            defaults_are_free,
-            half_precision_is_converted,
-            wrong_arguments_are_refused,
-        )
+        return law not in NOT_OF_PEERS
     if case.solver.startswith("net-"):
         return law not in (gradients_reach_the_inputs, padding_is_nothing) and law not in OF_BELIEVED
     samples = case.is_ransac or (case.focal == "unknown" and case.solver != "pnpnet-set")
