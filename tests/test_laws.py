@@ -12,9 +12,7 @@ from kornia.core.exceptions import ValueCheckError
 from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gradcheck, make
 from strategies import many
 
-from kornia_pnpnet import (
-    create_solver,
-)
+from kornia_pnpnet import create_solver
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import (
     BoxPoints,
