@@ -6,7 +6,6 @@ import pytest
 import torch
 from kornia.core.exceptions import ShapeError
 from kornia.geometry import solve_pnp_dlt
-from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.linalg import inverse_transformation, transform_points
 
@@ -17,13 +16,8 @@ from kornia_pnpnet.refine.residual import project
 
 def cameras(intrinsics):
     """Cameras of Kornia anywhere: where they are must not matter."""
-    batch = len(intrinsics)
-    matrix = torch.eye(4, dtype=intrinsics.dtype).repeat(batch, 1, 1)
-    matrix[:, :3, :3] = intrinsics
-    elsewhere = torch.eye(4, dtype=intrinsics.dtype).repeat(batch, 1, 1)
-    elsewhere[:, :3, 3] = 5.0
-    height, width = torch.full((2, batch), 7.0)
-    return PinholeCamera(matrix, elsewhere, height, width)
+    eye = torch.eye(3, dtype=intrinsics.dtype).expand(len(intrinsics), 3, 3)
+    return Pose(eye, torch.full_like(eye[:, 0], 5.0)).camera(intrinsics, height=7, width=7)
 
 
 def test_covariances_and_first_guesses_take_cameras(make_problems):
