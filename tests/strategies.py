@@ -48,7 +48,8 @@ RANGES = st.tuples(ANY, ANY)
 BOOL = st.booleans()
 # Without a slash, which would make a word the name of a repository on the Hub.
 TEXT = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), max_size=12)
-OPTIONS = [*KERNELS, *BACKWARDS, "additive", "msac", "AP3P", "EPNP", "USAC_FAST", "epnp-lm", "pnpnet-n9"]
+OPTIONS = ["fixed", "adaptive", "unknown", "always"]
+OPTIONS += [*KERNELS, *BACKWARDS, "additive", "msac", "AP3P", "EPNP", "USAC_FAST", "epnp-lm", "pnpnet-n9"]
 WORD = TEXT | st.sampled_from(OPTIONS)
 ARGUMENTS = ["800,800,320,240", "epnp", "p3p-ransac:threshold=2", "pnpnet-set:m=", "epnp:1", "nan", "-1", "--x"]
 WORDS = TEXT | st.sampled_from(ARGUMENTS)

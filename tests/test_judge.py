@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from doubtful import doubtful
+from doubtful import INTRINSICS, doubtful
 from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, at_pose, copies, evidence
+from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, at_pose, evidence
 from kornia_pnpnet.problem import Noise, Problem, State
 
 ROOT = Path(__file__).parents[1]
@@ -38,18 +38,6 @@ def found(problem, pose, known=False):
     return evidence(at_pose(State.of(pose), problem, votes), problem, votes)
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.5, 3.0, 12.0])
-@pytest.mark.parametrize("outliers", [0, 60])
-def test_the_noise_and_the_inliers_are_those_of_the_data(sigma, outliers):
-    problem, pose = scene(100, outliers, sigma)
-    result = found(problem, pose)
-    shown = 1000.0 * result.sigma.median()
-    assert shown == pytest.approx(sigma, rel=0.1 if sigma < 10.0 else 0.2)
-    inlier = result.inlier > 0.5
-    assert inlier[:, outliers:].double().mean() > 0.98
-    assert not outliers or inlier[:, :outliers].double().mean() < 0.1
-
-
 def test_given_noise_is_kept_unless_the_residuals_contradict():
     problem, pose = scene(60, 20, 1.0)
     for given, factor in ((1.0, 1.0), (2.0, 1.0), (0.1, 64.0)):
@@ -68,9 +56,6 @@ def test_evidence_rises_with_pairs_and_falls_with_noise_and_with_an_incorrect_po
 
 
 def test_copies_share_one_vote():
-    rows = torch.tensor([[[1.0, 2.0], [3.0, 4.0], [1.0, 2.0], [1.0, 2.0]]])
-    there = torch.tensor([[True, True, True, False]])
-    assert copies(rows, there).tolist() == [[2.0, 1.0, 2.0, 2.0]]
     problem, pose = scene(12, 3, 0.5)
     twice = Problem.of(*(x.repeat(1, 2, 1) for x in problem[:2]), 1000.0)
     votes = Votes.of(twice, twice.weights[:, :1] < 0).pairs
@@ -88,7 +73,7 @@ def test_doubtful_poses_are_not_ok_and_right_poses_of_tags_are(name):
         if (name.endswith("n20") and pairs != 20) or (pairs < 4):
             continue
         with torch.no_grad():
-            result = create_solver(name)(kind.world_points, kind.img_points, _INTRINSICS, **kind.given)
+            result = create_solver(name)(kind.world_points, kind.img_points, INTRINSICS, **kind.given)
         turn = torch.full((100,), torch.inf)
         if kind.truth is not None:
             turn = pose_errors(result.pose, kind.truth).rotation_error_deg
@@ -99,24 +84,17 @@ def test_doubtful_poses_are_not_ok_and_right_poses_of_tags_are(name):
             assert result.inliers[turn < 2.0].double().mean() > 0.98, kind.name
 
 
-_INTRINSICS = torch.tensor([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
-
-
+@pytest.mark.parametrize("sigma", [0.05, 0.5, 3.0, 12.0])
+@pytest.mark.parametrize("outliers", [0, 60])
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac"])
-def test_a_result_tells_noise_inliers_and_covariance(name):
-    """Errors of least squares on Gaussian noise are those of the covariance from the shown noise."""
-    generator = torch.Generator().manual_seed(3)
-    p = SyntheticProblems(n=50, batch_size=400, seed=3, outliers=OutlierMix(count=10), world_sigma=0.0, img_sigma=0.0)
-    p = p.batch(0)
-    pixels = p.img_points + 2.0 * torch.randn(p.img_points.shape, generator=generator)
+def test_the_noise_and_the_inliers_are_those_of_the_data(name, sigma, outliers):
+    world_points, img_points = scene(100, outliers, sigma)[0][:2]
+    solver = create_solver(name, **({"threshold": 4.0 * sigma} if name == "p3p-ransac" else {}))
     with torch.no_grad():
-        result = create_solver(name)(p.world_points, pixels, p.intrinsics)
-        covariance = result.covariance(p.world_points, pixels, p.intrinsics).double()
-    assert result.sigma.median() == pytest.approx(2.0, rel=0.05)
-    assert result.inliers[p.inliers].double().mean() > 0.98
-    turn = pose_errors(result.pose, p.pose).rotation_error_deg.deg2rad().square().median()
-    expected = covariance[:, :3, :3].diagonal(dim1=1, dim2=2).sum(-1).median()
-    assert 0.5 * expected < turn < 1.2 * expected  # the median of a square is below its mean
+        result = solver(world_points, img_points, torch.diag(torch.tensor([1000.0, 1000.0, 1.0])))
+    assert result.sigma.median() == pytest.approx(sigma, rel=0.1 if sigma < 10.0 else 0.2)
+    assert result.inliers[:, outliers:].double().mean() > 0.98
+    assert not outliers or result.inliers[:, :outliers].double().mean() < 0.1
 
 
 @pytest.mark.parametrize("sigmas", [{}, {"img_sigma": 1.0, "world_sigma": 0.05}], ids=["unknown", "given"])
@@ -148,19 +126,17 @@ def test_probability_is_observed_as_often():
     assert near[~sure].double().mean() < near[sure].double().mean() - 0.2
 
 
-def test_a_result_prints_in_five_lines():
+def test_a_result_prints_anywhere():
     p = SyntheticProblems(n=12, batch_size=4, seed=3, outliers=OutlierMix(count=2)).batch(0)
     solver = create_solver("epnp-lm")
     with torch.no_grad():
         many = solver(torch.where(torch.arange(4)[:, None, None] == 1, torch.nan, p.world_points), *p[1:3])
         single = solver(*(x[0] for x in p[:3]))
-    for result, expected in ((many, "NOT_FINITE"), (single, "rotation vector"), (many._replace(sigma=None), "tensor")):
-        assert expected in repr(result)
-        assert (repr(result).count("\n") == 4) == (result.sigma is not None)
-    assert f"sigma {single.sigma:.4g} px" in repr(single)
-    assert f"inliers {single.inliers.sum()} of 12" in repr(single)
     meta = solver(*(x.to("meta") for x in p[:3]))
+    assert "NOT_FINITE" in repr(many)
     assert "meta" in repr(meta)
+    assert repr(single)
+    assert repr(many._replace(sigma=None))
     torch.func.vmap(lambda x: (repr(single._replace(sigma=x)), x)[1])(torch.ones(2))
 
 

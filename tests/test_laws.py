@@ -12,10 +12,7 @@ from kornia.core.exceptions import ValueCheckError
 from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gradcheck, make
 from strategies import many
 
-from kornia_pnpnet import (
-    create_solver,
-    heatmap_keypoints,
-)
+from kornia_pnpnet import create_solver
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import (
     BoxPoints,
@@ -45,6 +42,7 @@ QUICK = [
     *(Case(name, dtype=torch.float32) for name in PEERS),
 ]
 FEW_GRADIENTS = [Case("identity-lm", *x) for x in ([], ["rig", "covariance"], ["pixels", "sigma", "unknown"])]
+FEW_GRADIENTS += [Case("identity-lm", extra="prior"), Case("identity-lm", focal="unknown", extra="radial")]
 GRADIENTS = [Case("identity-lm", *x) for x in product(CAMERAS, NOISES, FOCALS)]
 REFUSED = [Case(name, camera, focal="unknown") for name, camera in product(SOLVERS, ("rig", "bearings"))]
 
@@ -97,12 +95,6 @@ def test_both_precisions_see_the_same_problems(points, n, seed, outliers):
     single, double = (source(**options, dtype=dtype).batch(seed) for dtype in (torch.float32, torch.float64))
     assert double.world_points.dtype == torch.float64
     assert same(single, map_tensors(lambda x: x.float() if x.is_floating_point() else x, double))
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_heat_maps_of_half_precision_are_those_of_float32(dtype, generator):
-    heatmaps = torch.randn(1, 2, 4, 5, generator=generator).to(dtype)
-    assert_same(heatmap_keypoints(heatmaps), heatmap_keypoints(heatmaps.float()))
 
 
 # --- PyTorch's defaults -----------------------------------------------------------------------------------------------

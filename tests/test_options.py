@@ -64,7 +64,7 @@ def options_of(constructor):
 def solves(part, values):
     """A solver with this part has finite results."""
     key = {RobustWeightedLM: "refine", Normalize: "normalize"}.get(type(part), "init")
-    solver = part if isinstance(part, PeerSolver) else PnPNet(**{"init": EPnP(), key: part})
+    solver = part if isinstance(part, PeerSolver | PnPNet) else PnPNet(**{"init": EPnP(), key: part})
     n = values.get("n", 9)
     finite(*solver(PROBLEMS.world_points[:, :n], PROBLEMS.img_points[:, :n], PROBLEMS.intrinsics)[:4])
 
@@ -130,6 +130,7 @@ CASES = [
     *((part, part, solves) for part in SOLVER_PARTS),
     (MLPInit, lambda n=9, **sizes: MLPInit(n, **sizes), solves),
     (RANSAC, partial(RANSAC, P3P()), solves),
+    *((PnPNet, partial(create_solver, name), solves) for name in ("pnpnet-set", "pnpnet-n9", "p3p-ransac", "epnp-lm")),
     *((loss, loss, costs) for loss in (PoseLoss, SetLoss)),
     *((points, partial(with_points, points), is_sound) for points in POINTS),
     (MixedPoints, partial(with_points, partial(MixedPoints, [BoxPoints()] * 2)), is_sound),

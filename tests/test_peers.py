@@ -9,9 +9,8 @@ from helpers import assert_same, reprojection_errors
 from kornia.core.exceptions import BaseError
 from laws import OPENCV, PEERS
 
-from kornia_pnpnet import create_solver, pose_errors, success, success_rate
+from kornia_pnpnet import create_solver, pose_errors, success
 from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, PeerPose, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.result import PnPResult, Problems
 
@@ -68,27 +67,6 @@ def test_cost_is_the_mean_squared_error_truncated_at_the_threshold(name, make_pr
     assert name in ROBUST or (result.weights[picked] == 1).all()
 
 
-# Success on 5000 problems each of other seeds without outliers, with a random number and with exactly 3.
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("opencv-sqpnp", (0.906, 0.229, 0.0)),
-        ("opencv-epnp", (0.828, 0.205, 0.0)),
-        ("opencv-ransac", (0.848, 0.775, 0.674)),
-        ("opencv-usac", (0.894, 0.820, 0.701)),
-        ("kornia-rs", (0.808, 0.727, 0.627)),
-        ("poselib", (0.852, 0.778, 0.677)),
-        ("pycolmap", (0.851, 0.776, 0.675)),
-    ],
-)
-def test_protocol_success_is_what_was_measured_before(name, expected):
-    solver = make(name)
-    for mix, rate in zip((OutlierMix(count=0), OutlierMix(), OutlierMix(count=3)), expected, strict=True):
-        problems = SyntheticProblems(batch_size=300, seed=78, outliers=mix).batch(0)
-        measured = success_rate(success(pose_errors(solve(solver, problems).pose, problems.pose)))
-        assert measured.low - 0.03 < rate < measured.high + 0.03
-
-
 def test_refining_keeps_the_ransac_pose_as_init(make_problems):
     problems = make_problems(batch=30)
     rough, fine = solve(OpenCVRansac(refine=False), problems), solve(OpenCVRansac(), problems)
@@ -115,28 +93,11 @@ def test_rubbish_of_any_size_neither_raises_nor_comes_back_infinite(name, genera
     assert 0 < result.ok.sum() < 48
 
 
-@pytest.mark.parametrize("name", PEERS)
-def test_absent_pairs_do_not_matter(name, make_problems):
-    solver = make(name)
-    problems = make_problems(n=12, batch=5)
-    first = problems._replace(world_points=problems.world_points[:, :9], img_points=problems.img_points[:, :9])
-    expected = solve(solver, first)
-    absent = torch.arange(12).expand(5, 12) >= 9
-    spoilt = problems._replace(world_points=problems.world_points.masked_fill(absent[..., None], torch.nan))
-    masked = solve(solver, spoilt, mask=~absent)
-    weighted = solve(solver, problems, weights=torch.where(absent, 0.0, 0.3).double())
-    for result in (masked, weighted):
-        assert (result.weights[absent] == 0).all()
-        assert_same(result._replace(weights=result.weights[:, :9], inliers=result.inliers[:, :9]), expected)
-
-
-def test_too_few_pairs_bad_weights_and_a_skew_fail_without_an_error(make_problems):
+def test_too_few_pairs_and_a_skew_fail_without_an_error(make_problems):
     skewed = make_problems(batch=4).map(torch.clone)
     skewed.intrinsics[2, 0, 1] = 5.0
     assert solve(OpenCVRansac(), skewed).ok.tolist() == [True, True, False, True]
     assert not solve(OpenCVRansac(), make_problems(n=3, batch=4)).ok.any()
-    weights = torch.tensor([-1.0, torch.nan, 1.0]).double()[:, None].expand(3, 9)
-    assert solve(OpenCVRansac(), make_problems(batch=3), weights=weights).ok.tolist() == [False, False, True]
 
 
 FEW = {"min_iterations": 2, "max_iterations": 4}

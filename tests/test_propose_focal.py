@@ -163,24 +163,6 @@ def test_radial_distortion_is_estimated_with_the_focal_length(name, radial):
     torch.testing.assert_close(known.rotation, result.rotation, rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("radial", [1, 2])
-def test_gradcheck_to_radial_distortion(radial):
-    """The gradient of pose, focal length and distortion to points, pixels and weights of two pairs."""
-    p, pixels, _ = seen_through_a_lens(radial, n=10, batch=1, seed=5, fov=(60.0, 80.0))
-    solver, camera = create_solver("p3p-ransac", focal="unknown", radial=radial), withheld(p)
-
-    def solve(*some):
-        of_pairs = p.world_points, pixels, torch.ones_like(pixels[..., 0])
-        points, seen, weights = (torch.cat((x, y[:, 2:]), 1) for x, y in zip(some, of_pairs, strict=True))
-        result = solver(points, seen, camera, weights)
-        assert result.ok.all()
-        return result.rotation, result.translation, result.intrinsics[:, 0, 0].log(), result.dist[:, :radial]
-
-    inputs = [p.world_points[:, :2], pixels[:, :2], torch.full((1, 2), 0.5, dtype=torch.float64)]
-    inputs = [x.clone().requires_grad_() for x in inputs]
-    assert torch.autograd.gradcheck(solve, inputs, eps=1e-5, atol=1e-6, rtol=1e-4)
-
-
 def test_radial_distortion_is_a_minimum_as_accurate_as_the_noise_allows():
     """A further Gauss-Newton step is short, and normalised errors are chi-square with 8 degrees of freedom."""
     batch = 400

@@ -36,20 +36,19 @@ def test_exact_pairs_give_the_exact_pose(name, n, planar, make_problems):
     assert pose_errors(Pose(*(x.double() for x in single.pose)), p.pose).rotation_error_deg.max() < 0.2
 
 
-@pytest.mark.parametrize(("n", "planar", "share"), [(5, False, 1.0), (4, True, 0.99), (4, False, 0.85)])
-def test_four_and_five_exact_pairs_work_through_the_null_space(n, planar, share, make_problems):
-    p = make_problems(n, 500, noise=False)
-    p = flattened(p) if planar else p
-    errors = pose_errors(SOLVERS["EPnP"]()(*p[:3]).pose, p.pose)
-    assert (errors.rotation_error_deg < 1e-3).double().mean() >= share
-
-
-@pytest.mark.parametrize("thickness", [1e-1, 1e-3, 1e-8])
-def test_nearly_planar_points_are_solved(thickness, make_problems):
+@pytest.mark.parametrize(
+    ("n", "thickness", "limit", "share"),
+    [
+        *((5, None, 1e-3, 1.0), (4, 0.0, 1e-3, 0.99), (4, None, 1e-3, 0.85)),
+        *((9, thickness, 1.0, 0.98) for thickness in (1e-1, 1e-3, 1e-8)),
+    ],
+)
+def test_few_pairs_and_nearly_planar_points_are_solved(n, thickness, limit, share, make_problems):
     """Below a threshold the thickness is dropped and acts as noise of that size."""
-    p = flattened(make_problems(9, 200, noise=False), thickness)
+    p = make_problems(n, 500, noise=False)
+    p = p if thickness is None else flattened(p, thickness)
     errors = pose_errors(SOLVERS["EPnP"]()(*p[:3]).pose, p.pose)
-    assert (errors.rotation_error_deg < 1.0).double().mean() >= 0.98
+    assert (errors.rotation_error_deg < limit).double().mean() >= share
 
 
 @pytest.mark.parametrize("name", ["EPnP", "EPPnP"])
@@ -101,16 +100,6 @@ def test_success_on_the_protocols_problems(n, most, floor):
     assert mix is None or mix.max_count(n) == most
     p = SyntheticProblems(n=n, batch_size=1000, seed=7, outliers=mix).batch(0)
     assert rate(SOLVERS["REPPnP"]()(*p[:3]), p) > floor
-
-
-@pytest.mark.parametrize("planar", [False, True])
-@pytest.mark.parametrize("n", [4, 6, 9, 50])
-def test_success_is_at_least_opencvs(n, planar):
-    pytest.importorskip("cv2")
-    source = SyntheticProblems(n=n, batch_size=1000, seed=2002, world_sigma=0.05 * (not planar), dtype=torch.float64)
-    p = flattened(source.batch(0)) if planar else source.batch(0)
-    theirs = rate(create_solver("opencv-epnp")(*p[:3]), p)
-    assert rate(SOLVERS["EPnP"]()(*p[:3]), p) >= theirs - 0.01
 
 
 @pytest.mark.parametrize("planar", [False, True])

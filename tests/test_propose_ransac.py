@@ -6,12 +6,10 @@ import math
 import pytest
 import torch
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_errors, success
+from kornia_pnpnet import PnPNet, RobustWeightedLM, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import State
-from kornia_pnpnet.propose.epnp import EPnP
-from kornia_pnpnet.propose.minimal import SubsetSolver
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.sampling import (
@@ -30,30 +28,21 @@ def uniform_numbers(count, size):
     return torch.rand(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-@pytest.mark.parametrize(("count", "size"), [(6, 3), (9, 7), (5, 1)])
-def test_every_subset_is_equally_likely(count, size):
-    draws = 20000
-    upper = torch.tensor([1.0 / count] * count + [0.0], dtype=torch.float64).cumsum(0)
-    subsets = draw(uniform_numbers(draws, size), upper[None])[0].sort(-1).values
-    assert (subsets.diff(dim=-1) > 0).all()  # no item twice
-    _, seen = subsets.unique(dim=0, return_counts=True)
-    expected = draws / math.comb(count, size)
-    assert len(seen) == math.comb(count, size)
-    chi_square = ((seen - expected) ** 2 / expected).sum()
-    degrees = len(seen) - 1
-    assert chi_square < degrees + 4.0 * math.sqrt(2.0 * degrees)
-
-
-def test_likely_items_are_drawn_more_often_and_none_twice():
+@pytest.mark.parametrize(
+    "chances", [[0.5, 0.2, 0.0, 0.2, 0.1], [0.2] * 5 + [0.0]], ids=["some are likelier", "all are equally likely"]
+)
+@pytest.mark.parametrize("size", [1, 3])
+def test_items_are_drawn_by_their_chances_and_none_twice(size, chances):
     """Items one after the other in proportion to their probabilities among those that are left."""
-    draws, chances = 40000, torch.tensor([0.5, 0.2, 0.0, 0.2, 0.1], dtype=torch.float64)
-    subsets = draw(uniform_numbers(draws, 3), chances.cumsum(-1)[None])[0]
-    for order in itertools.permutations((0, 1, 3, 4), 3):
-        a, b, c = (chances[i].item() for i in order)
-        expected = a * b / (1 - a) * c / (1 - a - b)
+    draws, upper = 40000, torch.tensor(chances, dtype=torch.float64).cumsum(-1)[None]
+    subsets = draw(uniform_numbers(draws, size), upper)[0]
+    likely = [i for i, chance in enumerate(chances) if chance]
+    for order in itertools.permutations(likely, size):
+        drawn = [chances[i] for i in order]
+        expected = math.prod(chance / (1 - sum(drawn[:i])) for i, chance in enumerate(drawn))
         seen = (subsets == torch.tensor(order)).all(-1).double().mean().item()
         assert abs(seen - expected) < 4 * math.sqrt(expected / draws), order
-    assert (subsets != 2).all()
+    assert torch.isin(subsets, torch.tensor(likely)).all()
     assert (subsets.sort(-1).values.diff(dim=-1) > 0).all()
 
 
@@ -171,16 +160,6 @@ def test_exact_recovery_among_outliers(n, outliers, scorer, make_problems):
     # An outlier may fall on the right place by chance; an inlier is never missed.
     assert (result.weights > 0)[problems.inliers].all()
     assert ((result.weights > 0) & ~problems.inliers).double().mean() < 0.01
-
-
-@pytest.mark.parametrize("outliers", [0, 3])
-def test_the_papers_ransac_finds_the_pose(outliers, make_problems):
-    """EPnP and the robust LM on subsets of seven of nine; with three outliers every subset holds one."""
-    problems = make_problems(9, 50, outliers=outliers, noise=False)
-    minimal = SubsetSolver(EPnP(), RobustWeightedLM(m=5, learnable=False), size=7)
-    result = solve(solver(minimal, threshold=5.0), problems)
-    right = success(pose_errors(result.pose, problems.pose)).double().mean()
-    assert right > (0.3 if outliers else 0.95)
 
 
 def test_weights_decide_between_two_poses(make_problems):

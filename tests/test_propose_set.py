@@ -8,11 +8,10 @@ import sys
 
 import pytest
 import torch
+from helpers import assert_same
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from torch import nn
 
-from kornia_pnpnet import MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
-from kornia_pnpnet.core.trees import iter_tensors
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.propose.mlp import rotation_about
 
@@ -23,11 +22,6 @@ def solver(**options):
     torch.manual_seed(0)
     refine = RobustWeightedLM(4, kernel="geman_mcclure", robustness=6.0)
     return PnPNet(SetInit(**options), refine, Normalize(order=False), effort="fixed").double().eval()
-
-
-def near(a, b, tolerance=1e-6):
-    for mine, others in zip(a, b, strict=True):
-        torch.testing.assert_close(mine, others, rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize(("n", "outliers"), [(4, 0), (9, 0), (9, 4), (60, 0), (60, 50)])
@@ -94,7 +88,7 @@ def test_padding_costs_nothing(make_problems):
     assert shapes[0] == (30, 57)
     assert all(b * n <= 400 for b, n in shapes[1:])
     assert {n for _, n in shapes[1:]} == {20, 33, 57}
-    near(iter_tensors(parts), iter_tensors(whole), 1e-9)
+    assert_same(parts, whole, 1e-9, 1e-9)
     assert (parts.weights[~mask] == 0).all()
 
 
@@ -131,27 +125,10 @@ def test_padding_changes_nothing_where_the_network_sees_some_pairs(make_problems
     padded = [torch.nn.functional.pad(x, (0, 0, 0, 30)) for x in p[:2]]
     mask = torch.arange(130).expand(20, 130) < 100
     net = PnPNet.from_pretrained("pnpnet-set").double().eval()
-    near(net(*padded, p.intrinsics, mask=mask).pose, net(*p[:3]).pose)
+    assert_same(net(*padded, p.intrinsics, mask=mask).pose, net(*p[:3]).pose, 1e-6, 1e-6)
 
 
 # --- the paper's network ----------------------------------------------------------------------------------------------
-
-
-def sizes(module):
-    return [(layer.in_features, layer.out_features) for layer in module if isinstance(layer, nn.Linear)]
-
-
-@pytest.mark.parametrize("n", [6, 12])
-def test_layers_are_the_papers(n):
-    net = MLPInit(n)
-    assert sizes(net.shared) == [(5 * n, 20 * n), (20 * n, 5 * n), (5 * n, 3 * n)]
-    branch = [(3 * n, 2 * n)] + 4 * [(2 * n, 2 * n)]
-    assert sizes(net.rotation) == [*branch, (2 * n, 4)]
-    assert sizes(net.translation) == [*branch, (2 * n, 3)]
-    # A ReLU after each layer, except the last layer of a branch.
-    for module, is_branch in ((net.shared, False), (net.rotation, True), (net.translation, True)):
-        assert [type(layer) for layer in module] == (len(sizes(module)) * [nn.Linear, nn.ReLU])[: len(module)]
-        assert isinstance(module[-1], nn.Linear) == is_branch
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -211,14 +211,6 @@ def test_memory_of_the_backward_pass(backward, most, make_problems):
 # --- hyperparameters -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shared", [True, False])
-@every_kernel
-def test_hyperparameters_start_classical(kernel, shared):
-    lm = RobustWeightedLM(m=4, kernel=kernel, shared=shared)
-    for parameter, value in (lm.step, 1.0), (lm.damping, 1e-3), (lm.robustness, KERNELS[kernel].default):
-        torch.testing.assert_close(parameter(), torch.full((1 if shared else 4,), value), rtol=1e-5, atol=0)
-
-
 # --- kernels ----------------------------------------------------------------------------------------------------------
 
 

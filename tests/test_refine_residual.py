@@ -1,4 +1,4 @@
-"""Laws of the residual, its normal equations, the retraction and the rotation angle."""
+"""Laws of the residual, its normal equations and the retraction."""
 
 import math
 
@@ -6,20 +6,12 @@ import pytest
 import torch
 from helpers import assert_same, verified_derivative
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Pose
 from kornia_pnpnet.core.symmetric import Symmetric2
-from kornia_pnpnet.problem import Noise, Problem, State
+from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine import residual
-from kornia_pnpnet.refine.residual import (
-    moved,
-    normal_equations,
-    pixel_covariance,
-    pixel_variance,
-    project,
-    retract,
-)
+from kornia_pnpnet.refine.residual import normal_equations, project, retract
 
 FOCAL, RADIAL = 3400.0, torch.tensor([[0.05, -0.02]], dtype=torch.float64)
 
@@ -69,20 +61,6 @@ def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, rand
         assert ((found.gradient - gradient) / size).abs().max() < 1e-8 * FOCAL
 
 
-def test_a_zoom_keeps_the_image_of_the_origin(random_rotations):
-    """Its pixel and its scale; the coefficients of distortion add up."""
-    state, problem = scene("pixels", 2, random_rotations(7))
-    state = state._replace(camera=0.0 * state.camera)
-    delta = torch.zeros(8, 7, dtype=torch.float64)
-    delta[6], delta[7] = 0.2, 0.1
-    zoomed = moved(state, delta)
-    torch.testing.assert_close(zoomed.camera, torch.tensor([[0.2, 0.1]], dtype=torch.float64).expand(7, 2))
-    scales = [project(x, problem).focal / x.pose.translation[:, 2] for x in (state, zoomed)]
-    torch.testing.assert_close(*scales)
-    assert zoomed.pose.translation[:, :2].equal(state.pose.translation[:, :2])
-    assert zoomed.pose.rotation.equal(state.pose.rotation)
-
-
 def test_points_behind_the_camera_have_finite_gradients():
     world = torch.tensor([[[1.0, 2.0, z] for z in (-1.0, 0.0, 1e-30, 5.0)]], requires_grad=True)
     for unknown in (0, 3):
@@ -121,23 +99,3 @@ def test_retraction_by_anything_is_a_rotation_with_finite_gradients(length, dtyp
     assert (torch.linalg.det(there.rotation) > 0.5).all()
     there.rotation.sum().backward()
     assert delta.grad.isfinite().all()
-
-
-# --- noise ----------------------------------------------------------------------------------------------------------
-
-
-def test_variance_and_covariance_are_those_of_the_pixel(make_problems, generator):
-    """Against the noise of many draws; the variance is the mean over both coordinates."""
-    p, draws = make_problems(n=5, batch=1, noise=False), 100_000
-    points = p.world_points + 0.05 * torch.randn(draws, 5, 3, generator=generator, dtype=torch.float64)
-    problem = Problem.of(p.world_points, p.img_points, p.intrinsics[0, 0, 0])
-    cam = transform_points(p.pose.matrix.expand(draws, 4, 4), points)
-    pixels = problem.focal * cam[..., :2] / cam[..., 2:]
-    pixels += 2.0 * torch.randn(draws, 5, 2, generator=generator, dtype=torch.float64)
-    projection, noise = project(State.of(p.pose), problem), Noise(2.0 * problem.weights, 0.05 * problem.weights)
-    variance = pixel_variance(projection, noise)[0]
-    torch.testing.assert_close(variance, pixels.var(0).mean(-1), rtol=0.02, atol=0)
-    uu, uv, vv = (x[0] for x in pixel_covariance(projection, problem, noise))
-    found = torch.stack((uu, uv, uv, vv), -1).view(5, 2, 2)
-    expected = torch.stack([torch.cov(x) for x in pixels.permute(1, 2, 0)])
-    assert ((found - expected).abs() < 0.03 * variance[:, None, None]).all()

@@ -178,25 +178,9 @@ def test_opposite_directions(generator):
     torch.testing.assert_close(torch.linalg.det(prior.pose.rotation), torch.ones(4, dtype=torch.float64))
 
 
-def test_gradients(make_problems, generator):
-    """To the pose, information and scale of a prior, and through the function that makes one of gravity."""
-    problems = make_problems(n=5, batch=1, outliers=0)
-    prior, truth = drawn(problems, generator), problems.pose
-    root = prior.information.diagonal(dim1=1, dim2=2).sqrt()
-    down = torch.randn(1, 3, generator=generator, dtype=torch.float64)
-    cam = (truth.rotation @ down[..., None])[..., 0] + 0.01
-
-    def given(delta, root, scale):
-        return PosePrior(retract(prior.pose, delta), torch.diag_embed(root**2), scale)
-
-    for make, inputs in (
-        (given, (torch.zeros(1, 6).double(), root, torch.full((1,), 2.0, dtype=torch.float64))),
-        (gravity_prior, (down, cam, torch.full((1,), 0.02, dtype=torch.float64))),
-    ):
-
-        def answer(*values, make=make):
-            options = {"init": truth, "gradient": "always", "img_sigma": 1.0}
-            return refiner(10)(*problems[:3], prior=make(*values), **options).matrix[:, :3]
-
-        leaves = [x.requires_grad_() for x in inputs]
-        assert torch.autograd.gradcheck(answer, leaves, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)
+def test_gradients_of_gravity(generator):
+    down = torch.randn(3, 1, 3, generator=generator, dtype=torch.float64)
+    inputs = down[0], down[0] + 0.1 * down[1], torch.full((1,), 0.02, dtype=torch.float64)
+    leaves = [x.requires_grad_() for x in inputs]
+    relative = lambda *x: (gravity_prior(*x).pose.rotation, 1e-3 * gravity_prior(*x).information)  # noqa: E731
+    assert torch.autograd.gradcheck(relative, leaves)

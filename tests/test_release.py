@@ -96,7 +96,6 @@ create_solver("pnpnet-set")(world_points, img_points, intrinsics).rotations
 """
 
 
-@pytest.mark.slow
 def test_a_script_is_typed_and_wrong_arguments_are_found(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT + WRONG)

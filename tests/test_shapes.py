@@ -1,8 +1,7 @@
-"""The functions beside the solvers refuse other shapes and numbers without sense; cameras are one batch."""
+"""The functions beside the solvers refuse other shapes and numbers without sense."""
 
 import pytest
 import torch
-from helpers import assert_same
 from kornia.core.exceptions import BaseError
 
 from kornia_pnpnet import (
@@ -16,19 +15,6 @@ from kornia_pnpnet import (
 )
 from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.losses import pose_distances
-
-
-def test_cameras_of_poses_are_one_batch(make_problems):
-    p = make_problems(batch=6)
-    pose, camera = p.pose, p.intrinsics
-    expected, nested = pose.camera(camera), Pose(*(x.unflatten(0, (2, 3)) for x in pose))
-    for found, part in (
-        (nested.camera(camera.unflatten(0, (2, 3))), slice(None)),
-        (nested.camera(expected), slice(None)),
-        (Pose(*(x[1] for x in pose)).camera(camera[1]), slice(1, 2)),
-    ):
-        assert_same((found.intrinsics, found.extrinsics), (expected.intrinsics[part], expected.extrinsics[part]))
-
 
 CAMERA, PIXELS = torch.eye(3), torch.zeros(2, 5, 2)
 POSES = Pose(CAMERA.expand(2, 3, 3), torch.zeros(2, 3))

@@ -83,6 +83,13 @@ def test_poses_covariances_and_weights_are_those_of_a_dense_solver():
         torch.testing.assert_close(robust.weights[i], 1.0 / (1.0 + distance / 9.0), rtol=1e-6, atol=0)
 
 
+def test_an_isotropic_covariance_is_a_sigma():
+    p, sigma = problems(), torch.linspace(0.01, 0.1, 36, dtype=DOUBLE).view(4, 9)
+    known = {"world_cov": sigma.square()[..., None, None] * torch.eye(3, dtype=DOUBLE)}
+    found = pose_covariance(p.pose, *p[:3], img_cov=p.img_cov, **known)
+    torch.testing.assert_close(found, pose_covariance(p.pose, *p[:3], img_cov=p.img_cov, world_sigma=sigma))
+
+
 # -- bad covariances -----------------------------------------------------------------------------------------------
 
 
@@ -138,13 +145,16 @@ def test_covariances_reach_the_bound_and_sigmas_do_not():
     assert (errors[2] > 1.15 * errors[0]).all()
 
 
-def test_the_likelihood_is_that_of_the_covariances():
-    """Laplace's approximation, exact in the limit, of pixels and points with covariances."""
+@pytest.mark.parametrize("sigmas", [{}, {"img_sigma": 0.5}, {"img_sigma": 0.5, "world_sigma": 0.002}])
+def test_the_likelihood_is_that_of_the_covariances(sigmas):
+    """Laplace's approximation, exact in the limit: the density of the covariance at the mode."""
     p = problems(n=60, img_sigma=0.5, world_sigma=0.002)
-    mode = least_squares()(*p[:3], init=p.pose, **covs(p)).pose
-    expected = 0.5 * torch.logdet(2.0 * math.pi * pose_covariance(mode, *p[:3], **covs(p)))
+    given = {name: torch.full((4, 60), x, dtype=DOUBLE) for name, x in sigmas.items()} or covs(p)
+    mode = least_squares()(*p[:3], init=p.pose, **given).pose
+    known = {"world_sigma": 0.0, **given} if "img_sigma" in given else given
+    expected = 0.5 * torch.logdet(2.0 * math.pi * pose_covariance(mode, *p[:3], **known))
     torch.manual_seed(0)
-    noise = {name: x.clone().requires_grad_() for name, x in covs(p).items()}
+    noise = {name: x.clone().requires_grad_() for name, x in given.items()}
     loss = monte_carlo_pose_loss(mode, mode, *p[:3], **noise, samples=2000, kernel="truncated", scale=1e3)
     assert_same(loss, expected, atol=0.1)
     for gradient in torch.autograd.grad(loss.sum(), list(noise.values())):
