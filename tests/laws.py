@@ -569,8 +569,7 @@ def gradcheck(case: Case) -> None:
     Each input moves relative to its own size, so that one difference step suits all.
     """
     call, _ = make(case._replace(solver="identity-lm"), 1)
-    if not case.extra:  # beside other terms the largest weight is a constant unit
-        call["weights"] = torch.linspace(0.6, 1.4, PAIRS, dtype=torch.float64)[None]
+    call["weights"] = torch.linspace(0.6, 1.4, PAIRS, dtype=torch.float64)[None]
     lm = RobustWeightedLM(3, kernel="cauchy", robustness=5.0, learnable=False)
     if case.focal == "unknown":  # from a start that is a constant to the minimum
         lm = RobustWeightedLM(12, robustness=0.0, damping=1e-6, learnable=False)

@@ -77,8 +77,8 @@ def lengths(vectors: Tensor) -> Tensor:
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide values (B, N) by the largest ``size`` of their problem, or by 1 if it is 0. ``size`` gets no gradient."""
-    largest = size.detach().amax(1, keepdim=True)
+    """Divide values (B, N) by the largest ``size`` of their problem, or by 1 if it is 0."""
+    largest = size.amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
 

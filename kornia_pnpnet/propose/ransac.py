@@ -149,7 +149,7 @@ class RANSAC(Initialiser):
             )
         # If tensors are contiguous, the rounding of sums over pairs does not depend on the position in the batch.
         problem = problem._replace(noise=None).map(torch.Tensor.contiguous)
-        problem = problem._replace(weights=relative(problem.weights, problem.weights))
+        problem = problem._replace(weights=relative(problem.weights, problem.weights.detach()))
         fixed = problem.map(torch.Tensor.detach)
         img, world = self.threshold * fixed.img_scale, self.world_threshold * fixed.world_scale
         thresholds = Thresholds(img[:, None], world[:, None])

@@ -265,8 +265,8 @@ class RobustWeightedLM(Configured):
             known = torch.stack(given[:2]).isfinite().any(-1).any(0)[:, None]
         problem = problems_last(problem._replace(noise=_complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
-        # A common factor of the weights does not change a step. The division prevents underflow of their products.
-        guided = by_residual = relative(prior, prior)
+        # The division prevents underflow. Without terms, a common factor of the weights does not change a step.
+        guided = by_residual = relative(prior, prior if problem.terms else prior.detach())
         if self.by_residual:
             prior = problem.weights
             # Unlike the largest weight, the mean of the positive weights is differentiable.
