@@ -4,7 +4,6 @@ A contender makes a task of a batch of problems. A task can be timed, forward or
 many problems its poses solve.
 """
 
-import re
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -173,7 +172,7 @@ class Ours(Contender):
             solver = PnPNet(solver.init, RobustWeightedLM(ITERATIONS, reject_worse=False), solver.normalize).eval()
         self.solver: nn.Module = solver.float().to(device)
         self.device = device
-        self.n = int(found[1]) if (found := re.match(r"pnpnet-n(\d+)", spec)) else None
+        self.n = getattr(solver.init, "n", None)
         self.solver.requires_grad_(spec.startswith("pnpnet-"))
         if compiled:
             compile_or_raise(self.solver, **options)

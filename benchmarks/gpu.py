@@ -6,9 +6,7 @@ README.md beside this file describes the measurements.
 import gc
 import itertools
 import json
-import math
 import os
-import re
 import time
 import warnings
 from collections import Counter
@@ -30,6 +28,7 @@ from kornia_pnpnet import PnPNet, create_solver, list_solvers, pose_errors, succ
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import iter_tensors, take
 from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.refine.residual import rotation_angle
 from kornia_pnpnet.result import Pose, Problems
 
 #: Largest difference of a pose that counts as the same, in radians, and of a gradient, relative to its length.
@@ -49,7 +48,6 @@ class Amount(NamedTuple):
     graphs: tuple[str, ...] = ("pnpnet-n9", "pnpnet-set")
     modes: tuple[str, ...] = ("eager", "compiled", "reduce-overhead", "captured")
     calls: tuple[int, ...] = (1, 100, 1000)
-    directions: tuple[str, ...] = (FORWARD, BACKWARD)
     # Solvers and efforts whose waits for the GPU are counted.
     waits: tuple[tuple[str, str | None], ...] = (
         *(("pnpnet-n9", "fixed"), ("pnpnet-n9", None)),
@@ -85,8 +83,7 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         if not isinstance(solver, PnPNet):
             continue
         say(f"parity: {name}")
-        fixed = re.search(r"-n(\d+)", name)
-        problems = draw(int(fixed[1]) if fixed else N, amount.parity)
+        problems = draw(getattr(solver.init, "n", N), amount.parity)
         for dtype, limit in LIMITS.items():
             case = {"solver": name, "dtype": str(dtype).removeprefix("torch."), "limit": limit, "count": amount.parity}
             found = []
@@ -99,7 +96,7 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
                 continue
             (rotation, _, ok, slope), (other_rotation, _, other_ok, other_slope) = found
             both = ok & other_ok
-            turned = rotation_difference(rotation, other_rotation)
+            turned = rotation_angle(rotation, other_rotation)
             length = torch.maximum(slope.norm(dim=1), other_slope.norm(dim=1)).clamp(min=torch.finfo(dtype).tiny)
             change = (slope - other_slope).norm(dim=1) / length
             poses = [Pose(*(x.double() for x in one[:2])) for one in found]
@@ -118,11 +115,6 @@ def reason(error: BaseException) -> str:
     while error.__context__ is not None:
         error = error.__context__
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
-
-
-def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
-    """Angles between rotations, radians, shape (B,). Exact to the first order, also where the angle is tiny."""
-    return (one - other).flatten(1).norm(dim=1) / math.sqrt(2.0)
 
 
 #: By mode the options of ``solver.compile``; ``None``: not compiled.
@@ -158,7 +150,7 @@ def captured(call: Callable[[], _Found]) -> Callable[[], _Found]:
 
 def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     """Time a call of each mode, of solvers with a fixed effort, forward and with gradients to points and pixels."""
-    for name, direction in itertools.product(amount.graphs, amount.directions):
+    for name, direction in itertools.product(amount.graphs, (FORWARD, BACKWARD)):
         torch.compiler.reset()
         solvers = {mode: create_solver(name, effort="fixed").to(device, torch.float32) for mode in amount.modes}
         for mode, solver in solvers.items():
@@ -194,7 +186,7 @@ def _modes(
         tasks[mode] = task
         expected = expected or (rotation, ok, slope)
         modes[mode] |= {
-            "rotation_difference": float(rotation_difference(rotation, expected[0]).max()),
+            "rotation_difference": float(rotation_angle(rotation, expected[0]).max()),
             "same_ok": share(ok == expected[1]),
             "same_gradient": share((slope - expected[2]).norm(dim=1) <= 1e-2 * expected[2].norm(dim=1)),
         }
@@ -285,11 +277,8 @@ def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[st
     with Work() as counted:
         task.call()
     moved = [*(2 if backward else 1) * problems[:2], problems.intrinsics, *problems.pose]
-    total = {
-        "least_bytes": sum(4 * x.numel() for x in moved),
-        "bytes": counted.bytes,
-        "flops": counted.flops,
-    }  # float32
+    least = sum(4 * x.numel() for x in moved)  # float32
+    total = {"least_bytes": least, "bytes": counted.bytes, "flops": counted.flops}
     return {key: value / task.size for key, value in total.items()}
 
 
