@@ -4,6 +4,7 @@ A contender makes a task of a batch of problems. A task can be timed, forward or
 many problems its poses solve.
 """
 
+import time
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -15,6 +16,7 @@ from harness import HERE, say, seconds
 from kornia.geometry import solve_pnp_dlt
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
+from torch.utils.benchmark import timer
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, Starts, pose_errors, success, success_rate
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
@@ -52,7 +54,7 @@ class Task(NamedTuple):
     call: Callable[[], Any]  # solves all problems once, forward, or forward and backward
     poses: Callable[[], Pose]  # of all problems, in their frame; not timed
     problems: Problems
-    device: str = "cpu"  # a call on a GPU is timed until the GPU has finished
+    device: str = "cpu"  # PyTorch's timer waits until a GPU has finished
 
     @property
     def size(self) -> int:
@@ -61,16 +63,7 @@ class Task(NamedTuple):
 
     def seconds(self, times: int = 1) -> float:
         """Seconds of a call, the mean over ``times`` calls."""
-        if self.device == "cpu":
-            return seconds(self.call, times)
-
-        def everything() -> None:
-            for _ in range(times):
-                self.call()
-            torch.cuda.synchronize()
-
-        torch.cuda.synchronize()
-        return seconds(everything) / times
+        return seconds(self.call, times, time.perf_counter if self.device == "cpu" else timer)
 
     def us(self, times: int = 1) -> float:
         """Microseconds per problem, the mean over ``times`` calls."""

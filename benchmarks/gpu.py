@@ -44,7 +44,7 @@ class Amount(NamedTuple):
     """How much is measured. The first mode is what the others are compared with."""
 
     parity: int = 1000  # problems of each solver that both devices solve
-    # CUDA graphs: solvers, keys of MODES and batch sizes; then contenders, batch sizes and numbers of pairs.
+    # CUDA graphs: solvers, modes and batch sizes; then contenders, batch sizes and numbers of pairs.
     graphs: tuple[str, ...] = ("pnpnet-n9", "pnpnet-set")
     modes: tuple[str, ...] = ("eager", "compiled", "reduce-overhead", "captured")
     calls: tuple[int, ...] = (1, 100, 1000)
@@ -117,13 +117,8 @@ def reason(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
-#: By mode the options of ``solver.compile``; ``None``: not compiled.
-MODES: dict[str, dict[str, str] | None] = {
-    "eager": None,
-    "compiled": {},
-    "reduce-overhead": {"mode": "reduce-overhead"},
-    "captured": None,
-}
+#: Options of ``solver.compile`` by mode. The modes "eager" and "captured" do not compile.
+COMPILED: dict[str, dict[str, str]] = {"compiled": {}, "reduce-overhead": {"mode": "reduce-overhead"}}
 
 
 def captured(call: Callable[[], _Found]) -> Callable[[], _Found]:
@@ -154,8 +149,8 @@ def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         torch.compiler.reset()
         solvers = {mode: create_solver(name, effort="fixed").to(device, torch.float32) for mode in amount.modes}
         for mode, solver in solvers.items():
-            if (options := MODES[mode]) is not None:
-                contenders.compile_or_raise(solver, **options)
+            if mode in COMPILED:
+                contenders.compile_or_raise(solver, **COMPILED[mode])
         for batch in amount.calls:
             say(f"graphs: {name}, B = {batch}, {direction}")
             modes = _modes(solvers, batch, device, amount.rounds, direction)

@@ -115,8 +115,7 @@ def outside(pose: Pose) -> Tensor:
 
 def project(pose: Pose, points: Tensor) -> Tensor:
     """Pixels (B, K, 2) of points of the box."""
-    cam = points @ pose.rotation.mT + pose.translation[:, None]
-    return FOCAL * cam[..., :2] / cam[..., 2:] + CAMERA[:2, 2]
+    return pose.camera(CAMERA).project(points.expand(len(pose.rotation), -1, -1))
 
 
 def render(pose: Pose) -> tuple[Tensor, Tensor]:

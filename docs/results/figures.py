@@ -468,7 +468,7 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
 
 _RAW_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
     "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
-    ":adaptive": {"marker": "^"},
+    "=adaptive": {"marker": "^"},
 }
 
 
@@ -493,12 +493,11 @@ def plot_real_matches(
     table = find_rows(results, "no ratio test")
     times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}
     solvers = costs["settings"]["solvers"]
-    shown = {name: re.sub(r",?\w+_iterations=\d+|:threshold=\d+|effort=", "", name) for name in solvers}
-    looks = solver_styles(shown.values())
+    looks = solver_styles(solvers)
     for name, style in looks.items():
         for part, look in _RAW_LOOKS.items():
             style |= look if part in name else {}
-    styles = {titles[solver]: looks[shown[solver]] for solver in solvers}
+    styles = {titles[solver]: looks[solver] for solver in solvers}
     figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
     plots = ("success", " %", "outliers (%)"), ("ms", " %", "outliers (%)"), ("ms", " pairs", "pairs")
     for axes, (value, unit, label) in zip(figure.subplots(1, 3), plots, strict=True):

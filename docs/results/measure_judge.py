@@ -149,31 +149,22 @@ _SYNTHETIC = ("matches, 9 pairs", "matches, 50 pairs", "uniform, 9 pairs")
 _AT_ONCE = 60  # problems of real matches in a call
 
 
-def _one_of_each(rows: Tensor, there: Tensor) -> Tensor:
-    """No pair is a copy."""
-    return torch.ones_like(rows[..., 0])
-
-
 def _keeps_noise(self: RobustWeightedLM, plan: Any, now: Any) -> Any:
     """The estimated noise of the points stays."""
     return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
 
 
-def _any_points(world_points: Tensor, inliers: Tensor) -> Tensor:
-    return inliers.any(-1)
-
-
 #: Each part of the judge: the object, the name in the object, and the value that switches the part off.
 PARTS: dict[str, tuple[Any, str, Any]] = {
     "wide inliers": (evidence, "_TAIL", 0.0),
-    "votes of copies": (evidence, "copies", _one_of_each),
+    "votes of copies": (evidence, "copies", lambda rows, there: torch.ones_like(rows[..., 0])),  # no pair is a copy
     "choice of the points' noise": (RobustWeightedLM, "shown", _keeps_noise),
     "rival of larger noise": (alternatives, "_GAP", -math.inf),
     "rival of the search": (alternatives, "_APART", math.inf),
     "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
     "limit of the pose's standard deviation": (evidence, "_OPEN", math.inf),
     "limit of the noise": (evidence, "_MOST_NOISE", math.inf),
-    "points off a line": (evidence, "_leave_a_line", _any_points),
+    "points off a line": (evidence, "_leave_a_line", lambda world_points, inliers: inliers.any(-1)),
 }
 
 
