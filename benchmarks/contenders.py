@@ -29,8 +29,8 @@ from kornia_pnpnet.result import Pose, Problems
 
 #: The paper's solver as it is shipped, and the solver for any number of pairs.
 TRAINED, ANY = "pnpnet-n9", "pnpnet-set"
-#: The network of ``TRAINED`` with one guess, ``ITERATIONS`` and classical hyperparameters. The targets were set for
-#: this number of iterations; the trained hyperparameters belong to more.
+#: The network of ``TRAINED`` with one guess, ``ITERATIONS`` and classical hyperparameters: the trained ones belong to
+#: more iterations.
 PLAIN = "net-n9+lm"
 WHOLE = f"{PLAIN} compiled whole"
 #: Iterations of every refinement with classical hyperparameters.

@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 import contenders
 import torch
 from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw
-from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, share, summary
+from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, seconds, share, summary
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.benchmark import timer
 from torch.utils.flop_counter import flop_registry
 
 from kornia_pnpnet import PnPNet, create_solver, list_solvers, pose_errors, success, success_rate
@@ -34,8 +35,6 @@ from kornia_pnpnet.result import Pose, Problems
 #: Largest difference of a pose that counts as the same, in radians, and of a gradient, relative to its length.
 LIMITS = {torch.float32: 1e-3, torch.float64: 1e-6}
 _DRAWN = 10_000  # problems; larger batches repeat them
-
-
 # Rotations (B, 3, 3), translations (B, 3), ``ok`` (B,), and gradients (B, 5 N).
 _Found = tuple[Tensor, Tensor, Tensor, Tensor]
 
@@ -256,11 +255,9 @@ def machine_rates(device: str, amount: Amount) -> dict[str, float]:
     """Bytes per second of a copy, read and written, and operations per second of a product of float32 matrices."""
     source = torch.zeros(amount.copied, device=device)
     target, matrix = torch.empty_like(source), torch.ones(amount.side, amount.side, device=device)
-    problems = draw(N, 1)  # of the tasks; not solved
 
     def quickest(call: Callable[[], object]) -> float:
-        task = Task(call, lambda: problems.pose, problems, device)
-        return min(task.seconds() for _ in range(10))
+        return min(seconds(call, clock=timer) for _ in range(10))
 
     copy, product = quickest(lambda: target.copy_(source)), quickest(lambda: matrix @ matrix)
     return {"bytes_per_s": 2 * source.nbytes / copy, "flops_per_s": 2 * amount.side**3 / product}

@@ -267,7 +267,6 @@ def test(network: Keypoints, solver: nn.Module, *, with_sigma: bool, batches: in
         "mean_distance": away.clamp(max=1.0).mean().item(),
         "mean_rotation_deg": angle.mean().item(),
         "median_distance": away.median().item(),
-        "median_rotation_deg": angle.median().item(),
         "mean_keypoint_px": pixel.mean().item(),
     }
 
