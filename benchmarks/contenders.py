@@ -117,6 +117,7 @@ class Contender:
     differentiable = True  # whether there are gradients
     n: int | None = None  # the only number of pairs that the solver takes, if there is one
     device = "cpu"
+    solver: Any = nn.Module()  # whose parameters get gradients
 
     def takes(self, n: int) -> bool:
         """Whether the contender gets problems of ``n`` pairs."""
@@ -138,10 +139,6 @@ class Contender:
         """Solve the problems once more, for their poses in the frame of the problems."""
         return self.pose(self.call(inputs))
 
-    def learned(self) -> list[Tensor]:
-        """Parameters that get gradients."""
-        return []
-
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """Prepare a batch; this is not timed."""
         inputs = self.inputs(problems)
@@ -149,7 +146,7 @@ class Contender:
         if backward:
             # A clone would change the layout in memory in which the solver hands pairs over.
             leaves = [x.detach().requires_grad_() for x in inputs[:2]]
-            learned = self.learned()
+            learned = [x for x in self.solver.parameters() if x.requires_grad]
             call = lambda: gradient(self.pose(self.call([*leaves, *inputs[2:]])), [*leaves, *learned])  # noqa: E731
         return Task(call, lambda: self.poses(problems, inputs), problems, self.device)
 
@@ -163,7 +160,7 @@ class Ours(Contender):
         solver: Any = load_solver(spec)
         if classical:
             solver = PnPNet(solver.init, RobustWeightedLM(ITERATIONS, reject_worse=False), solver.normalize).eval()
-        self.solver: nn.Module = solver.float().to(device)
+        self.solver = solver.float().to(device)
         self.device = device
         self.n = getattr(solver.init, "n", None)
         self.solver.requires_grad_(spec.startswith("pnpnet-"))
@@ -173,10 +170,6 @@ class Ours(Contender):
     def call(self, inputs: Any) -> Any:
         """Call the solver with the whole batch."""
         return self.solver(*inputs)
-
-    def learned(self) -> list[Tensor]:
-        """Parameters of the network and of the refinement."""
-        return [x for x in self.solver.parameters() if x.requires_grad]
 
 
 class Refinement(Ours):

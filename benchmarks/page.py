@@ -93,10 +93,7 @@ def gpu_section(results: Row | None) -> dict[str, Any] | None:
     part = results["throughput"]
     rows = [row for row in part["rows"] if "median_us" in row]
     loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
-    groups: dict[tuple[str, int, str], list[Row]] = {}
-    for row in rows:
-        if "work" in row:
-            groups.setdefault((row["contender"], row["n"], row["mode"]), []).append(row)
+    groups = figures.grouped((row for row in rows if "work" in row), "contender", "n", "mode")
     lines = []
     for group in groups.values():
         best = min(group, key=lambda row: row["median_us"])

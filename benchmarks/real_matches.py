@@ -440,11 +440,10 @@ def judge(matches: Matches, pose: Pose) -> tuple[Tensor, Tensor]:
 
 def worst_failures(matches: Matches, far: Tensor) -> list[int]:
     """Of each scene the far-off pose with the most inliers under the reference pose, the most first."""
-    inliers = torch.where(matches.counts & far, matches.problems.inliers.sum(1), -1)
+    inliers = matches.problems.inliers.sum(1).tolist()
     best: dict[str, int] = {}
-    for at in inliers.argsort(descending=True, stable=True).tolist():
-        if inliers[at] >= 0:
-            best.setdefault(matches.scene[at], at)
+    for at in sorted((matches.counts & far).nonzero()[:, 0].tolist(), key=lambda at: -inliers[at]):
+        best.setdefault(matches.scene[at], at)
     return list(best.values())[:PICTURES]
 
 

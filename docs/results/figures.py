@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
 from itertools import cycle
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -472,13 +473,18 @@ _RAW_LOOKS = {  # a solver with more inputs keeps its colour and has another mar
 }
 
 
+def grouped(rows: Iterable[Mapping[str, Any]], *keys: str) -> dict[Any, list[Mapping[str, Any]]]:
+    """Rows by one of their entries, or by a tuple of several entries."""
+    found: dict[Any, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(itemgetter(*keys)(row), []).append(row)
+    return found
+
+
 def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapping[str, Any]]]:
     """The rows of one kind by solver and group."""
-    table: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for row in results["rows"]:
-        if row["kind"] == kind:
-            table.setdefault(row["solver"], {})[row["group"]] = row
-    return table
+    solvers = grouped((row for row in results["rows"] if row["kind"] == kind), "solver")
+    return {solver: {row["group"]: row for row in rows} for solver, rows in solvers.items()}
 
 
 @themed
