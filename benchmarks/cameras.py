@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import harness
 import numpy as np
 import poselib
@@ -26,6 +25,7 @@ from torch import Tensor, nn
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, create_solver
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data import OutlierMix, SceneProblems, load_scene
+from kornia_pnpnet.peers import OpenCVRansac
 from kornia_pnpnet.propose.focal import scale_focal
 from kornia_pnpnet.result import Pose, Problems
 
@@ -113,15 +113,12 @@ def colmap_focal(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: 
 def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: int) -> Any:
     """OpenCV's RANSAC at 21 focal lengths; the one with most inliers."""
     size, most, best = 2.0 * intrinsics[:2, 2].max(), 0, None
-    options: Any = {"reprojectionError": 5.0, "iterationsCount": 100, "flags": cv2.SOLVEPNP_SQPNP}
+    solver = OpenCVRansac(threshold=5.0, iterations=100, confidence=0.99, method="SQPNP", refine=False)
     for focal in np.geomspace(size / 2, 3 * size, 21):
         camera = np.array([[focal, 0, intrinsics[0, 2]], [0, focal, intrinsics[1, 2]], [0, 0, 1]])
-        try:
-            found, rvec, tvec, inliers = cv2.solvePnPRansac(world, img, camera, None, **options)
-        except cv2.error:
-            continue
-        if found and inliers is not None and len(inliers) > most:
-            most, best = len(inliers), (np.column_stack((cv2.Rodrigues(rvec)[0], tvec)), focal)
+        found = solver.solve_one(world, img, camera)
+        if found and found.inliers.sum() > most:
+            most, best = found.inliers.sum(), (np.column_stack(found[:2]), focal)
     return best
 
 

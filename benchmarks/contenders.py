@@ -4,7 +4,7 @@ A contender makes a task of a batch of problems. A task can be timed, forward or
 many problems its poses solve.
 """
 
-import re
+import time
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -16,6 +16,7 @@ from harness import HERE, say, seconds
 from kornia.geometry import solve_pnp_dlt
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor, nn
+from torch.utils.benchmark import timer
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, Starts, pose_errors, success, success_rate
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
@@ -28,8 +29,8 @@ from kornia_pnpnet.result import Pose, Problems
 
 #: The paper's solver as it is shipped, and the solver for any number of pairs.
 TRAINED, ANY = "pnpnet-n9", "pnpnet-set"
-#: The network of ``TRAINED`` with one guess, ``ITERATIONS`` and classical hyperparameters. The targets were set for
-#: this number of iterations; the trained hyperparameters belong to more.
+#: The network of ``TRAINED`` with one guess, ``ITERATIONS`` and classical hyperparameters: the trained ones belong to
+#: more iterations.
 PLAIN = "net-n9+lm"
 WHOLE = f"{PLAIN} compiled whole"
 #: Iterations of every refinement with classical hyperparameters.
@@ -53,7 +54,7 @@ class Task(NamedTuple):
     call: Callable[[], Any]  # solves all problems once, forward, or forward and backward
     poses: Callable[[], Pose]  # of all problems, in their frame; not timed
     problems: Problems
-    device: str = "cpu"  # a call on a GPU is timed until the GPU has finished
+    device: str = "cpu"  # PyTorch's timer waits until a GPU has finished
 
     @property
     def size(self) -> int:
@@ -62,16 +63,7 @@ class Task(NamedTuple):
 
     def seconds(self, times: int = 1) -> float:
         """Seconds of a call, the mean over ``times`` calls."""
-        if self.device == "cpu":
-            return seconds(self.call, times)
-
-        def everything() -> None:
-            for _ in range(times):
-                self.call()
-            torch.cuda.synchronize()
-
-        torch.cuda.synchronize()
-        return seconds(everything) / times
+        return seconds(self.call, times, time.perf_counter if self.device == "cpu" else timer)
 
     def us(self, times: int = 1) -> float:
         """Microseconds per problem, the mean over ``times`` calls."""
@@ -125,6 +117,7 @@ class Contender:
     differentiable = True  # whether there are gradients
     n: int | None = None  # the only number of pairs that the solver takes, if there is one
     device = "cpu"
+    solver: Any = nn.Module()  # whose parameters get gradients
 
     def takes(self, n: int) -> bool:
         """Whether the contender gets problems of ``n`` pairs."""
@@ -146,10 +139,6 @@ class Contender:
         """Solve the problems once more, for their poses in the frame of the problems."""
         return self.pose(self.call(inputs))
 
-    def learned(self) -> list[Tensor]:
-        """Parameters that get gradients."""
-        return []
-
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """Prepare a batch; this is not timed."""
         inputs = self.inputs(problems)
@@ -157,7 +146,7 @@ class Contender:
         if backward:
             # A clone would change the layout in memory in which the solver hands pairs over.
             leaves = [x.detach().requires_grad_() for x in inputs[:2]]
-            learned = self.learned()
+            learned = [x for x in self.solver.parameters() if x.requires_grad]
             call = lambda: gradient(self.pose(self.call([*leaves, *inputs[2:]])), [*leaves, *learned])  # noqa: E731
         return Task(call, lambda: self.poses(problems, inputs), problems, self.device)
 
@@ -171,9 +160,9 @@ class Ours(Contender):
         solver: Any = load_solver(spec)
         if classical:
             solver = PnPNet(solver.init, RobustWeightedLM(ITERATIONS, reject_worse=False), solver.normalize).eval()
-        self.solver: nn.Module = solver.float().to(device)
+        self.solver = solver.float().to(device)
         self.device = device
-        self.n = int(found[1]) if (found := re.match(r"pnpnet-n(\d+)", spec)) else None
+        self.n = getattr(solver.init, "n", None)
         self.solver.requires_grad_(spec.startswith("pnpnet-"))
         if compiled:
             compile_or_raise(self.solver, **options)
@@ -181,10 +170,6 @@ class Ours(Contender):
     def call(self, inputs: Any) -> Any:
         """Call the solver with the whole batch."""
         return self.solver(*inputs)
-
-    def learned(self) -> list[Tensor]:
-        """Parameters of the network and of the refinement."""
-        return [x for x in self.solver.parameters() if x.requires_grad]
 
 
 class Refinement(Ours):

@@ -6,9 +6,7 @@ README.md beside this file describes the measurements.
 import gc
 import itertools
 import json
-import math
 import os
-import re
 import time
 import warnings
 from collections import Counter
@@ -21,22 +19,22 @@ from typing import Any, NamedTuple
 import contenders
 import torch
 from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw
-from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, share, summary
+from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, seconds, share, summary
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.benchmark import timer
 from torch.utils.flop_counter import flop_registry
 
 from kornia_pnpnet import PnPNet, create_solver, list_solvers, pose_errors, success, success_rate
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import iter_tensors, take
 from kornia_pnpnet.evaluation.results import save_results
+from kornia_pnpnet.refine.residual import rotation_angle
 from kornia_pnpnet.result import Pose, Problems
 
 #: Largest difference of a pose that counts as the same, in radians, and of a gradient, relative to its length.
 LIMITS = {torch.float32: 1e-3, torch.float64: 1e-6}
 _DRAWN = 10_000  # problems; larger batches repeat them
-
-
 # Rotations (B, 3, 3), translations (B, 3), ``ok`` (B,), and gradients (B, 5 N).
 _Found = tuple[Tensor, Tensor, Tensor, Tensor]
 
@@ -45,11 +43,10 @@ class Amount(NamedTuple):
     """How much is measured. The first mode is what the others are compared with."""
 
     parity: int = 1000  # problems of each solver that both devices solve
-    # CUDA graphs: solvers, keys of MODES and batch sizes; then contenders, batch sizes and numbers of pairs.
+    # CUDA graphs: solvers, modes and batch sizes; then contenders, batch sizes and numbers of pairs.
     graphs: tuple[str, ...] = ("pnpnet-n9", "pnpnet-set")
     modes: tuple[str, ...] = ("eager", "compiled", "reduce-overhead", "captured")
     calls: tuple[int, ...] = (1, 100, 1000)
-    directions: tuple[str, ...] = (FORWARD, BACKWARD)
     # Solvers and efforts whose waits for the GPU are counted.
     waits: tuple[tuple[str, str | None], ...] = (
         *(("pnpnet-n9", "fixed"), ("pnpnet-n9", None)),
@@ -85,8 +82,7 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         if not isinstance(solver, PnPNet):
             continue
         say(f"parity: {name}")
-        fixed = re.search(r"-n(\d+)", name)
-        problems = draw(int(fixed[1]) if fixed else N, amount.parity)
+        problems = draw(getattr(solver.init, "n", N), amount.parity)
         for dtype, limit in LIMITS.items():
             case = {"solver": name, "dtype": str(dtype).removeprefix("torch."), "limit": limit, "count": amount.parity}
             found = []
@@ -99,7 +95,7 @@ def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
                 continue
             (rotation, _, ok, slope), (other_rotation, _, other_ok, other_slope) = found
             both = ok & other_ok
-            turned = rotation_difference(rotation, other_rotation)
+            turned = rotation_angle(rotation, other_rotation)
             length = torch.maximum(slope.norm(dim=1), other_slope.norm(dim=1)).clamp(min=torch.finfo(dtype).tiny)
             change = (slope - other_slope).norm(dim=1) / length
             poses = [Pose(*(x.double() for x in one[:2])) for one in found]
@@ -120,18 +116,8 @@ def reason(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
-def rotation_difference(one: Tensor, other: Tensor) -> Tensor:
-    """Angles between rotations, radians, shape (B,). Exact to the first order, also where the angle is tiny."""
-    return (one - other).flatten(1).norm(dim=1) / math.sqrt(2.0)
-
-
-#: By mode the options of ``solver.compile``; ``None``: not compiled.
-MODES: dict[str, dict[str, str] | None] = {
-    "eager": None,
-    "compiled": {},
-    "reduce-overhead": {"mode": "reduce-overhead"},
-    "captured": None,
-}
+#: Options of ``solver.compile`` by mode. The modes "eager" and "captured" do not compile.
+COMPILED: dict[str, dict[str, str]] = {"compiled": {}, "reduce-overhead": {"mode": "reduce-overhead"}}
 
 
 def captured(call: Callable[[], _Found]) -> Callable[[], _Found]:
@@ -158,12 +144,12 @@ def captured(call: Callable[[], _Found]) -> Callable[[], _Found]:
 
 def graphs(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     """Time a call of each mode, of solvers with a fixed effort, forward and with gradients to points and pixels."""
-    for name, direction in itertools.product(amount.graphs, amount.directions):
+    for name, direction in itertools.product(amount.graphs, (FORWARD, BACKWARD)):
         torch.compiler.reset()
         solvers = {mode: create_solver(name, effort="fixed").to(device, torch.float32) for mode in amount.modes}
         for mode, solver in solvers.items():
-            if (options := MODES[mode]) is not None:
-                contenders.compile_or_raise(solver, **options)
+            if mode in COMPILED:
+                contenders.compile_or_raise(solver, **COMPILED[mode])
         for batch in amount.calls:
             say(f"graphs: {name}, B = {batch}, {direction}")
             modes = _modes(solvers, batch, device, amount.rounds, direction)
@@ -194,7 +180,7 @@ def _modes(
         tasks[mode] = task
         expected = expected or (rotation, ok, slope)
         modes[mode] |= {
-            "rotation_difference": float(rotation_difference(rotation, expected[0]).max()),
+            "rotation_difference": float(rotation_angle(rotation, expected[0]).max()),
             "same_ok": share(ok == expected[1]),
             "same_gradient": share((slope - expected[2]).norm(dim=1) <= 1e-2 * expected[2].norm(dim=1)),
         }
@@ -269,11 +255,9 @@ def machine_rates(device: str, amount: Amount) -> dict[str, float]:
     """Bytes per second of a copy, read and written, and operations per second of a product of float32 matrices."""
     source = torch.zeros(amount.copied, device=device)
     target, matrix = torch.empty_like(source), torch.ones(amount.side, amount.side, device=device)
-    problems = draw(N, 1)  # of the tasks; not solved
 
     def quickest(call: Callable[[], object]) -> float:
-        task = Task(call, lambda: problems.pose, problems, device)
-        return min(task.seconds() for _ in range(10))
+        return min(seconds(call, clock=timer) for _ in range(10))
 
     copy, product = quickest(lambda: target.copy_(source)), quickest(lambda: matrix @ matrix)
     return {"bytes_per_s": 2 * source.nbytes / copy, "flops_per_s": 2 * amount.side**3 / product}
@@ -285,11 +269,8 @@ def work(contender: Contender, problems: Problems, *, backward: bool) -> dict[st
     with Work() as counted:
         task.call()
     moved = [*(2 if backward else 1) * problems[:2], problems.intrinsics, *problems.pose]
-    total = {
-        "least_bytes": sum(4 * x.numel() for x in moved),
-        "bytes": counted.bytes,
-        "flops": counted.flops,
-    }  # float32
+    least = sum(4 * x.numel() for x in moved)  # float32
+    total = {"least_bytes": least, "bytes": counted.bytes, "flops": counted.flops}
     return {key: value / task.size for key, value in total.items()}
 
 

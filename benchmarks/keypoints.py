@@ -23,6 +23,7 @@ from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 
 from kornia_pnpnet import create_solver, pose_errors
+from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.evaluation.results import save_results
@@ -56,9 +57,8 @@ def read(path: Path) -> tuple[Problems, float]:
 
 
 def reprojection(p: Problems) -> Tensor:
-    """Reprojection errors under the reference pose, in pixels, (P, N)."""
-    image = (p["world"] @ p["R"].mT + p["t"][:, None]) @ p["K"].mT
-    return (image[..., :2] / image[..., 2:] - p["img"]).norm(dim=-1)
+    """Reprojection errors under the reference pose, in pixels, (P, N); NaN behind the camera."""
+    return (reproject(p["world"], p["K"], Pose(p["R"], p["t"])) - p["img"]).norm(dim=-1)
 
 
 @torch.no_grad()
@@ -146,11 +146,8 @@ def main() -> None:
     columns = ("error", "capped", "median", "right", "ok")
     for one in made["results"]:
         print({key: value for key, value in one.items() if key != "rows"})
-        print(
-            markdown_table(
-                ["way", *columns], [[row["way"], *(f"{row[x]:.3f}" for x in columns)] for row in one["rows"]]
-            )
-        )
+        rows = [[row["way"], *(f"{row[x]:.3f}" for x in columns)] for row in one["rows"]]
+        print(markdown_table(["way", *columns], rows))
     save_results({**made, "sources": sources}, options.out)
 
 

@@ -93,10 +93,7 @@ def gpu_section(results: Row | None) -> dict[str, Any] | None:
     part = results["throughput"]
     rows = [row for row in part["rows"] if "median_us" in row]
     loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
-    groups: dict[tuple[str, int, str], list[Row]] = {}
-    for row in rows:
-        if "work" in row:
-            groups.setdefault((row["contender"], row["n"], row["mode"]), []).append(row)
+    groups = figures.grouped((row for row in rows if "work" in row), "contender", "n", "mode")
     lines = []
     for group in groups.values():
         best = min(group, key=lambda row: row["median_us"])
@@ -214,14 +211,12 @@ def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
 def render(folder: Path, path: Path) -> None:
     """Write the page and its pictures from the results files of a folder."""
     results, gpu = load_parts(folder)
-    rows, alone = (
-        [
-            x
-            for x in results[part]["rows"]
-            if x["threads"] == 1 and (is_whole(x["contender"]) or x["contender"] in DRAWN)
-        ]
-        for part in ("throughput", "latency")
-    )
+
+    def drawn(part: str) -> list[Row]:
+        one_thread = [x for x in results[part]["rows"] if x["threads"] == 1]
+        return [x for x in one_thread if is_whole(x["contender"]) or x["contender"] in DRAWN]
+
+    rows, alone = drawn("throughput"), drawn("latency")
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
     batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
     pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != N)]

@@ -8,8 +8,6 @@ import argparse
 import json
 import math
 import statistics
-import subprocess
-import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import page
 import torch
-from contenders import PLAIN, TRAINED, WHOLE, CannotBeTimedError, Contender, N, Task, draw, make_contenders
+from contenders import PLAIN, WHOLE, CannotBeTimedError, Contender, N, Task, draw, make_contenders
 from harness import BACKWARD, FORWARD, HERE, in_turns, recorded, run_child, say, summary, threads
 from page import CACHED, COLD, EAGER
 
@@ -30,7 +28,6 @@ from kornia_pnpnet.data import OutlierMix
 from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.result import Problems
 
-COMPILED = f"{TRAINED} compiled"
 _PROBE = 10  # problems of the first call of a loop
 _FEWEST_ROUNDS = 3
 # Pairs in a batch of the rows that vary n: the memory of some contenders grows with the square of n.
@@ -219,10 +216,6 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
 
 # The first batch size shows the compiler's warm-up, the others whether another size compiles again.
 _BATCHES = (1000, 999, 100, 10, 1)
-_IMPORTS = 5  # processes; the median counts
-_IMPORT = (
-    "import time, torch, kornia; start = time.perf_counter(); import kornia_pnpnet; print(time.perf_counter() - start)"
-)
 
 
 def measure_startup(settings: Settings) -> dict[str, Any]:
@@ -240,11 +233,7 @@ def measure_startup(settings: Settings) -> dict[str, Any]:
             # A loop needs the memory of one problem.
             batch = 0 if contender.loops else settings.memory_batch
             starts += start({"contender": name, "backward": backward, "memory_batch": batch}, settings)
-    command = [sys.executable, "-c", _IMPORT]
-    imports = [
-        float(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(_IMPORTS)
-    ]
-    return {"starts": starts, "imports_s": imports, "skipped": skipped}
+    return {"starts": starts, "skipped": skipped}
 
 
 def start(request: Mapping[str, Any], settings: Settings) -> list[dict[str, Any]]:

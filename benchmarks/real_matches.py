@@ -35,6 +35,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import pose_errors
+from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.trees import map_tensors, take
 from kornia_pnpnet.data.colmap import _find_model
@@ -439,11 +440,10 @@ def judge(matches: Matches, pose: Pose) -> tuple[Tensor, Tensor]:
 
 def worst_failures(matches: Matches, far: Tensor) -> list[int]:
     """Of each scene the far-off pose with the most inliers under the reference pose, the most first."""
-    inliers = torch.where(matches.counts & far, matches.problems.inliers.sum(1), -1)
+    inliers = matches.problems.inliers.sum(1).tolist()
     best: dict[str, int] = {}
-    for at in inliers.argsort(descending=True, stable=True).tolist():
-        if inliers[at] >= 0:
-            best.setdefault(matches.scene[at], at)
+    for at in sorted((matches.counts & far).nonzero()[:, 0].tolist(), key=lambda at: -inliers[at]):
+        best.setdefault(matches.scene[at], at)
     return list(best.values())[:PICTURES]
 
 
@@ -458,9 +458,7 @@ def draw_failure(matches: Matches, solved: Solved, at: int, folder: Path) -> dic
     figure = make_figure(WIDTH, 3.1)
     panels, fits = figure.subplots(1, 2, sharex=True, sharey=True), []
     for axes, (title, pose) in zip(panels, poses.items(), strict=True):
-        cam = world @ pose.rotation.T + pose.translation
-        image = cam @ problem.intrinsics.T
-        seen = image[:, :2] / torch.where(cam[:, 2:] > 0, cam[:, 2:], torch.nan)
+        seen = reproject(world[None], problem.intrinsics, map_tensors(lambda x: x[None], pose))[0]
         fit = (seen - pixels).norm(dim=1) < INLIER_PX
         fits.append(fit)
         axes.plot(*pixels[~fit].T, ".", color=GREY, markersize=2.5, label="pixels of other pairs")

@@ -102,12 +102,9 @@ def rows(folder: Path) -> int:
 
 def read(folder: Path) -> dict[str, np.ndarray]:
     """Results in the order of their ids, (B, …)."""
-    table = dataset.dataset(folder, format="parquet").to_table(columns=["id", "rotation", "translation", "ok"])
-    columns = {name: table[name].combine_chunks() for name in table.column_names}
-    ids = columns["id"].to_numpy()
-    order = ids.argsort(kind="stable")
-    poses = {name: columns[name].flatten().to_numpy().reshape(len(ids), -1)[order] for name in columns if name in POSE}
-    return {"id": ids[order], "ok": columns["ok"].to_numpy(zero_copy_only=False)[order], **poses}
+    table = dataset.dataset(folder, format="parquet").to_table(columns=["id", "ok", *POSE]).sort_by("id")
+    poses = {name: table[name].combine_chunks().flatten().to_numpy().reshape(len(table), -1) for name in POSE}
+    return {name: table[name].to_numpy() for name in ("id", "ok")} | poses
 
 
 def compare(expected: dict[str, np.ndarray], folder: Path) -> dict[str, int]:

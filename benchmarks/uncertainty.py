@@ -8,7 +8,6 @@ The page says what is measured.
 import itertools
 import math
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ import harness
 import numpy as np
 import torch
 from harness import share
-from kornia.geometry.liegroup import So3
-from kornia.geometry.linalg import transform_points
 from torch import Tensor, nn
 
 from kornia_pnpnet import (
@@ -30,12 +27,13 @@ from kornia_pnpnet import (
     pose_covariance,
     pose_errors,
 )
+from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.points import BoxPoints
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.metrics import success
-from kornia_pnpnet.peers import OpenCVPnP, PeerSolver, PoseLib
-from kornia_pnpnet.refine.residual import retract
+from kornia_pnpnet.refine.residual import retract, tangent
 from kornia_pnpnet.result import PnPResult, Pose, Problems
 
 SOLVER = "pnpnet-set"
@@ -47,10 +45,7 @@ SIZES, SHARES = (10, 30, 50, 110), (0.0, 0.3, 0.5)
 # Threshold of PoseLib in pixels, the best of 8, 12, 16, 20, 25, 30 and 40 on problems of another seed.
 THRESHOLD = 20.0
 #: Solvers of other libraries. The first two take no outliers.
-PEERS: dict[str, Callable[[], PeerSolver]] = {
-    name: partial(OpenCVPnP, method=name.upper()) for name in ("EPnP", "SQPnP")
-}
-PEERS["PoseLib"] = partial(PoseLib, threshold=THRESHOLD)
+PEERS = {"EPnP": "opencv-epnp", "SQPnP": "opencv-sqpnp", "PoseLib": f"poselib:threshold={THRESHOLD:g}"}
 #: For covariances of poses and for priors: number of pairs, and number of outliers among them.
 CREDIBLE = ((9, 0), (9, 2), (9, 4), (20, 0), (20, 10), (50, 0), (50, 25), (200, 0), (200, 100))
 FEW = ((3, 0), (4, 0), (4, 1), (5, 1), (6, 0), (6, 2), (9, 3), (12, 4))
@@ -142,8 +137,7 @@ def squares(tilt: float, sigma: float, count: int, *, seed: int) -> Problems:
     corners = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]
     world = torch.tensor(corners, dtype=torch.float64).expand(count, 4, 3)
     camera = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    seen = transform_points(pose.matrix, world) @ camera.mT
-    pixels = seen[..., :2] / seen[..., 2:]
+    pixels = reproject(world, camera, pose)
     pixels = pixels + sigma * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     return Problems(world, pixels, camera.expand(count, 3, 3), pose, torch.ones(count, 4, dtype=torch.bool))
 
@@ -164,7 +158,7 @@ def medians(result: PnPResult, problems: Problems) -> Tensor:
 def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     """Median errors relative to those of maximum likelihood, of each kind of pixels, size and share of outliers."""
     bound = KnownInliersAndNoise()
-    peers = {name: make() for name, make in PEERS.items()}
+    peers = {name: load_solver(spec) for name, spec in PEERS.items()}
     rows = []
     for turned, n, outliers in itertools.product((False, True), SIZES, SHARES):
         problems = uncertain_pnp(n, outliers, count, turned=turned, seed=SEED)
@@ -184,9 +178,7 @@ def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
 
 def squared_errors(result: PnPResult, problems: Problems, covariance: Tensor) -> Tensor:
     """Squared error of each pose by its covariance, (B,)."""
-    turn = result.rotation @ problems.pose.rotation.mT
-    trace = turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    omega = 2.0 * So3.vee(turn - turn.mT) / (1.0 + trace)  # Cayley's rotation vector
+    omega = tangent(result.rotation @ problems.pose.rotation.mT)
     error = torch.cat((omega, result.translation - problems.pose.translation), -1)
     return (error * torch.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
 

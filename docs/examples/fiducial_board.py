@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from rendered_hall import look_at
 from shared import centre, command, opencv, pose_error, write
 from torch.nn.utils.rnn import pad_sequence
 
@@ -31,11 +32,7 @@ def path(count: int) -> tuple[np.ndarray, np.ndarray]:
     radius, height = 0.22 + 0.06 * np.sin(3.0 * turn), 0.34 + 0.08 * np.cos(2.0 * turn)
     # z of the board points away from the camera: OpenCV's boards have y down.
     place = middle + np.stack((radius * np.cos(turn), radius * np.sin(turn), -height), -1)
-    forward = middle - place
-    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
-    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    return np.stack((right, np.cross(forward, right), forward), 1), place
+    return look_at(place, middle, np.array([0.0, 1.0, 0.0])), place
 
 
 def photograph(board: Any, rotation: np.ndarray, place: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -56,14 +56,13 @@ def draw(index: int, keypoints: Tensor, bias: Tensor) -> tuple[Tensor, Tensor, T
     rotation = random_poses(BATCH, generator).rotation.float()
     away = torch.rand(BATCH, 3, generator=generator) * torch.tensor([1.0, 1.0, 3.0]) + torch.tensor([-0.5, -0.5, 4.0])
     pose = Pose(rotation, away)
-    cam = keypoints @ rotation.mT + away[:, None]
-    img_points = FOCAL * cam[..., :2] / cam[..., 2:] + CENTRE
+    intrinsics = torch.tensor([[FOCAL, 0.0, CENTRE], [0.0, FOCAL, CENTRE], [0.0, 0.0, 1.0]]).expand(BATCH, 3, 3)
+    world_points = keypoints.expand(BATCH, -1, -1)
+    img_points = pose.camera(intrinsics).project(world_points)
     img_points = img_points + bias + PIXEL_NOISE * torch.randn(img_points.shape, generator=generator)
     anywhere = 2.0 * CENTRE * torch.rand(img_points.shape, generator=generator)
     wrong = torch.rand(BATCH, KEYPOINTS, generator=generator) < WRONG
-    intrinsics = torch.tensor([[FOCAL, 0.0, CENTRE], [0.0, FOCAL, CENTRE], [0.0, 0.0, 1.0]])
-    img_points = torch.where(wrong[..., None], anywhere, img_points)
-    return keypoints.expand(BATCH, -1, -1), img_points, intrinsics.expand(BATCH, 3, 3), pose
+    return world_points, torch.where(wrong[..., None], anywhere, img_points), intrinsics, pose
 
 
 def learn(solve: Solve, steps: int) -> dict[str, Any]:

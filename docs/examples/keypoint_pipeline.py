@@ -115,8 +115,7 @@ def outside(pose: Pose) -> Tensor:
 
 def project(pose: Pose, points: Tensor) -> Tensor:
     """Pixels (B, K, 2) of points of the box."""
-    cam = points @ pose.rotation.mT + pose.translation[:, None]
-    return FOCAL * cam[..., :2] / cam[..., 2:] + CAMERA[:2, 2]
+    return pose.camera(CAMERA).project(points.expand(len(pose.rotation), -1, -1))
 
 
 def render(pose: Pose) -> tuple[Tensor, Tensor]:
@@ -268,7 +267,6 @@ def test(network: Keypoints, solver: nn.Module, *, with_sigma: bool, batches: in
         "mean_distance": away.clamp(max=1.0).mean().item(),
         "mean_rotation_deg": angle.mean().item(),
         "median_distance": away.median().item(),
-        "median_rotation_deg": angle.median().item(),
         "mean_keypoint_px": pixel.mean().item(),
     }
 

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet import PnPResult, Pose, create_solver
+from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.evaluation.plots import BLUE, make_figure, save, themed
 
@@ -161,10 +162,8 @@ def match(query: Photo, references: Sequence[Photo], detector: Detector) -> Matc
 
 def errors_px(matches: Matches, photo: Photo) -> Tensor:
     """Reprojection errors (N,) of matches under the pose of the model, infinite behind the camera."""
-    cam_points = matches.world_points @ photo.pose.rotation.mT + photo.pose.translation
-    projected = cam_points @ photo.intrinsics.mT
-    error = (projected[:, :2] / projected[:, 2:] - matches.img_points).norm(dim=1)
-    return torch.where(cam_points[:, 2] > 0, error, torch.inf)
+    pixels = reproject(matches.world_points[None], photo.intrinsics, map_tensors(lambda x: x[None], photo.pose))[0]
+    return (pixels - matches.img_points).norm(dim=1).nan_to_num(torch.inf)
 
 
 def fit_scores(references: Sequence[Photo], detector: Detector) -> IsotonicRegression:

@@ -27,8 +27,7 @@ BLOB, NOISE = 1.5, 0.05  # radius of a keypoint's blob in pixels, and standard d
 
 def keypoints_of(pose: Pose) -> Tensor:
     """The true pixels of the keypoints, (B, N, 2): data of the images, no labels."""
-    points = SHAPE @ pose.rotation.mT + pose.translation[:, None]
-    return FOCAL * points[..., :2] / points[..., 2:] + CENTRE
+    return pose.camera(CAMERA).project(SHAPE.expand(len(pose.rotation), -1, -1))
 
 
 def draw(index: int, count: int) -> tuple[Tensor, Pose]:

@@ -89,12 +89,17 @@ def make_hall(seed: int = 0) -> list[Plane]:
     return planes
 
 
+def look_at(centre: Floats, target: Floats, down: Floats) -> Floats:
+    """Rotations (..., 3, 3) of level cameras that look from centres (..., 3) to a target."""
+    forward = (target - centre) / np.linalg.norm(target - centre, axis=-1, keepdims=True)
+    right = np.cross(down, forward)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    return np.stack((right, np.cross(forward, right), forward), -2)
+
+
 def photograph(hall: list[Plane], centre: Floats, target: Floats) -> View:
     """Render what a level camera sees from a place to a target by casting rays: image and smallest depths."""
-    forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(DOWN, forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack((right, np.cross(forward, right), forward))
+    rotation = look_at(centre, target, DOWN)
     translation = -rotation @ centre
     size = np.array([WIDTH, HEIGHT]) * SUPERSAMPLING
     columns, rows = np.meshgrid(*((np.arange(n) + 0.5) / SUPERSAMPLING for n in size))

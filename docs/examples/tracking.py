@@ -169,8 +169,6 @@ def track(
     return {
         "right": float(((metres < RIGHT[0]) & (degrees < RIGHT[1])).mean()),
         "rmse_m": float(np.sqrt((metres**2).mean())),
-        "median_m": float(np.median(metres)),
-        "median_deg": float(np.median(degrees)),
         "ms": 1000.0 * float(np.median(seconds)),
         "path": places(path),
     }

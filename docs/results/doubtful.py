@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from kornia_pnpnet import Pose
+from kornia_pnpnet.cameras import reproject
 
 #: Focal length 800, image of 1280 x 720 pixels.
 INTRINSICS = torch.tensor([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
@@ -46,8 +46,7 @@ def doubtful(count: int, seed: int) -> Iterator[Kind]:
         return Pose.from_rvec(tilt * normal(3), torch.tensor([0.0, 0.0, depth]) + shift)
 
     def seen(points: Tensor, pose: Pose, sigma: float) -> Tensor:
-        rays = transform_points(pose.matrix, points) @ INTRINSICS.mT
-        return rays[..., :2] / rays[..., 2:] + sigma * normal(points.shape[1], 2)
+        return reproject(points, INTRINSICS, pose) + sigma * normal(points.shape[1], 2)
 
     for pairs, copied in ((20, 0), (60, 0), (200, 0), (60, 9), (200, 10), (200, 20)):
         points, pixels = normal(pairs, 3), anywhere(pairs)

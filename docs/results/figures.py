@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
 from itertools import cycle
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -468,17 +469,22 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
 
 _RAW_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
     "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
-    ":adaptive": {"marker": "^"},
+    "=adaptive": {"marker": "^"},
 }
+
+
+def grouped(rows: Iterable[Mapping[str, Any]], *keys: str) -> dict[Any, list[Mapping[str, Any]]]:
+    """Rows by one of their entries, or by a tuple of several entries."""
+    found: dict[Any, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(itemgetter(*keys)(row), []).append(row)
+    return found
 
 
 def find_rows(results: Mapping[str, Any], kind: str) -> dict[str, dict[str, Mapping[str, Any]]]:
     """The rows of one kind by solver and group."""
-    table: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for row in results["rows"]:
-        if row["kind"] == kind:
-            table.setdefault(row["solver"], {})[row["group"]] = row
-    return table
+    solvers = grouped((row for row in results["rows"] if row["kind"] == kind), "solver")
+    return {solver: {row["group"]: row for row in rows} for solver, rows in solvers.items()}
 
 
 @themed
@@ -493,12 +499,11 @@ def plot_real_matches(
     table = find_rows(results, "no ratio test")
     times = {(row["solver"], row["group"]): row["ms_per_problem"] for row in costs["rows"]}
     solvers = costs["settings"]["solvers"]
-    shown = {name: re.sub(r",?\w+_iterations=\d+|:threshold=\d+|effort=", "", name) for name in solvers}
-    looks = solver_styles(shown.values())
+    looks = solver_styles(solvers)
     for name, style in looks.items():
         for part, look in _RAW_LOOKS.items():
             style |= look if part in name else {}
-    styles = {titles[solver]: looks[shown[solver]] for solver in solvers}
+    styles = {titles[solver]: looks[solver] for solver in solvers}
     figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
     plots = ("success", " %", "outliers (%)"), ("ms", " %", "outliers (%)"), ("ms", " pairs", "pairs")
     for axes, (value, unit, label) in zip(figure.subplots(1, 3), plots, strict=True):

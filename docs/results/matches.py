@@ -65,10 +65,10 @@ def pool(files: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Pooled]]:
     return found
 
 
-def best_peer(pooled: Mapping[str, Mapping[str, Pooled]], kind: str = "all") -> str:
+def best_peer(pooled: Mapping[str, Mapping[str, Pooled]]) -> str:
     """The PoseLib with the highest success."""
     peers = [name for name in pooled if name.startswith("PoseLib")]
-    return max(peers, key=lambda name: pooled[name][kind].success.rate)
+    return max(peers, key=lambda name: pooled[name]["all"].success.rate)
 
 
 def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

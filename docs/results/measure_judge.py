@@ -5,7 +5,7 @@ compares them.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 from unittest import mock
@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
-from kornia_pnpnet import PnPNet, Pose, Problems
+from kornia_pnpnet import PnPNet, Pose
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import ObjectPoints, OutlierMix, SceneProblems, SyntheticProblems, load_scene
@@ -64,18 +64,23 @@ def in_fit(kind: str) -> bool:
 
 
 class Drawn(NamedTuple):
-    """Problems of one kind, and the usual distance of their points from the camera, (B,)."""
+    """Problems of one kind: the arguments of a solver, and the true poses (``None``: no pose is right)."""
 
     name: str
     inputs: dict[str, Any]
     truth: Pose | None
-    distance: Tensor
 
     @classmethod
-    def of(cls, name: str, problems: Problems) -> Self:
-        """Problems of a source."""
-        inputs = dict(zip(ARGUMENTS, problems[:3], strict=True))
-        return cls(name, inputs, problems.pose, problems.true_cam_points[..., 2].median(1).values)
+    def of(cls, name: str, tensors: Sequence[Tensor], truth: Pose | None, **more: Any) -> Self:
+        """Problems of points, pixels and intrinsics, with further arguments of a solver."""
+        return cls(name, {**dict(zip(ARGUMENTS, tensors, strict=True)), **more}, truth)
+
+    @property
+    def distance(self) -> Tensor:
+        """Median depth of the points of each problem under the true pose, (B,)."""
+        assert self.truth is not None
+        depth = transform_points(self.truth.matrix, self.inputs["world_points"])[..., 2]
+        return depth.where(self.inputs.get("mask", depth.isfinite()), torch.nan).nanmedian(1).values
 
 
 def kinds(seed: int) -> Iterator[Drawn]:
@@ -87,13 +92,10 @@ def kinds(seed: int) -> Iterator[Drawn]:
         options: Any = OmegaConf.to_container(config[source], resolve=True)
         for n in sizes:
             drawn = {**options, "n": n, "batch_size": PROBLEMS, "seed": seed + n}
-            yield Drawn.of(f"{source.split('_')[0]}, {n} pairs", instantiate(drawn, _convert_="all").batch(0))
+            problems = instantiate(drawn, _convert_="all").batch(0)
+            yield Drawn.of(f"{source.split('_')[0]}, {n} pairs", problems[:3], problems.pose)
     for kind in doubtful(PROBLEMS, seed):
-        distance = torch.ones(PROBLEMS)
-        if kind.truth is not None:
-            distance = transform_points(kind.truth.matrix, kind.world_points)[..., 2].median(1).values
-        inputs = dict(zip(ARGUMENTS, (kind.world_points, kind.img_points, INTRINSICS), strict=True))
-        yield Drawn(kind.name, {**inputs, **kind.given}, kind.truth, distance)
+        yield Drawn.of(kind.name, (kind.world_points, kind.img_points, INTRINSICS), kind.truth, **kind.given)
 
 
 def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
@@ -147,31 +149,22 @@ _SYNTHETIC = ("matches, 9 pairs", "matches, 50 pairs", "uniform, 9 pairs")
 _AT_ONCE = 60  # problems of real matches in a call
 
 
-def _one_of_each(rows: Tensor, there: Tensor) -> Tensor:
-    """No pair is a copy."""
-    return torch.ones_like(rows[..., 0])
-
-
 def _keeps_noise(self: RobustWeightedLM, plan: Any, now: Any) -> Any:
     """The estimated noise of the points stays."""
     return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
 
 
-def _any_points(world_points: Tensor, inliers: Tensor) -> Tensor:
-    return inliers.any(-1)
-
-
 #: Each part of the judge: the object, the name in the object, and the value that switches the part off.
 PARTS: dict[str, tuple[Any, str, Any]] = {
     "wide inliers": (evidence, "_TAIL", 0.0),
-    "votes of copies": (evidence, "copies", _one_of_each),
+    "votes of copies": (evidence, "copies", lambda rows, there: torch.ones_like(rows[..., 0])),  # no pair is a copy
     "choice of the points' noise": (RobustWeightedLM, "shown", _keeps_noise),
     "rival of larger noise": (alternatives, "_GAP", -math.inf),
     "rival of the search": (alternatives, "_APART", math.inf),
     "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
     "limit of the pose's standard deviation": (evidence, "_OPEN", math.inf),
     "limit of the noise": (evidence, "_MOST_NOISE", math.inf),
-    "points off a line": (evidence, "_leave_a_line", _any_points),
+    "points off a line": (evidence, "_leave_a_line", lambda world_points, inliers: inliers.any(-1)),
 }
 
 
@@ -185,11 +178,11 @@ def sets(scenes: Path, seed: int) -> Iterator[Set]:
         if kind.name in _SYNTHETIC:
             yield kind._replace(name=f"synthetic, {kind.name}"), (2.0, 0.05), True
     noise: dict[str, Any] = {"img_sigma": (2.0, 20.0), "world_sigma": 0.0, "degrees": (2.0, 8.0)}
-    noise |= {"outliers": OutlierMix(max_ratio=0.4, mismatch_share=0.5)}
-    objects = SyntheticProblems(n=12, batch_size=500, seed=seed, points=ObjectPoints(), half_image=None, **noise)
-    yield Drawn.of("keypoints, synthetic", objects.batch(0)), (5.0, 0.05), True
-    door = SceneProblems(load_scene(scenes / "colmap" / "lund_door"), n=9, batch_size=1000, seed=seed)
-    yield Drawn.of("lund_door, 9 pairs", door.batch(0)), (1.0, 0.005), True
+    noise |= {"outliers": OutlierMix(max_ratio=0.4, mismatch_share=0.5), "points": ObjectPoints(), "half_image": None}
+    objects = SyntheticProblems(n=12, batch_size=500, seed=seed, **noise).batch(0)
+    yield Drawn.of("keypoints, synthetic", objects[:3], objects.pose), (5.0, 0.05), True
+    door = SceneProblems(load_scene(scenes / "colmap" / "lund_door"), n=9, batch_size=1000, seed=seed).batch(0)
+    yield Drawn.of("lund_door, 9 pairs", door[:3], door.pose), (1.0, 0.005), True
     for name, file, limits, relative in (
         ("outdoor matches", "raw/by_image.npz", (1.0, 0.01), True),
         ("indoor matches, RGB-D", "rgbd/indoor.npz", (5.0, 0.05), False),
@@ -199,10 +192,8 @@ def sets(scenes: Path, seed: int) -> Iterator[Set]:
         for number, label in ((0, "ratio test"), (1, "no ratio test")):
             mask, *rest = (x[key][x["kind"] == number] for key in "MWIKRt")
             world, img, cameras, rotation, translation = (value.float() for value in rest)
-            inputs = {**dict(zip(ARGUMENTS, (world, img, cameras), strict=True)), "mask": mask}
-            depth = (world @ rotation.mT + translation[:, None])[..., 2]
-            distance = depth.where(mask, torch.nan).nanmedian(1).values
-            yield Drawn(f"{name}, {label}", inputs, Pose(rotation, translation), distance), limits, relative
+            drawn = Drawn.of(f"{name}, {label}", (world, img, cameras), Pose(rotation, translation), mask=mask)
+            yield drawn, limits, relative
 
 
 @torch.no_grad()
@@ -223,7 +214,7 @@ def measure_judge(scenes: Path, seed: int) -> dict[str, Any]:
 def judged(one: Set) -> dict[str, Tensor]:
     """Solve a set: which poses are right, far off, and ``ok``."""
     solver, (drawn, limits, relative) = load_solver("pnpnet-set"), one
-    size = len(drawn.distance)
+    size = len(drawn.inputs["img_points"])
     at_once = _AT_ONCE if "mask" in drawn.inputs else size
     results = [solver(**{key: x[i : i + at_once] for key, x in drawn.inputs.items()}) for i in range(0, size, at_once)]
     result = map_tensors(lambda *x: torch.cat(x), *results)

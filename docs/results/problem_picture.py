@@ -4,10 +4,11 @@ import math
 from pathlib import Path
 
 import torch
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_points_from_homogeneous
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
+from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.plots import BLUE, GREY, VERMILION, WIDTH, make_figure, save, themed
 
@@ -64,8 +65,7 @@ def plot_problem(path: str | Path) -> Path:
     house = (_in_camera(_CORNERS).to(world) - truth.translation[0]) @ truth.rotation[0]
 
     def seen(points: Tensor) -> Tensor:
-        in_camera = points @ result.rotation[0].mT + result.translation[0]
-        return convert_points_from_homogeneous(in_camera @ problem.intrinsics[0].mT)
+        return reproject(points[None], problem.intrinsics, result.pose)[0]
 
     def upright(points: Tensor) -> Tensor:
         in_camera = points @ truth.rotation[0].mT + truth.translation[0]

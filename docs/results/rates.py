@@ -33,13 +33,6 @@ class Standing(NamedTuple):
     behind: dict[str, tuple[str, float]]
     overlapping: list[str]
 
-    def __str__(self) -> str:
-        total = len(self.ahead) + len(self.behind) + len(self.overlapping)
-        lost = "; ".join(f"{shown(data)}: `{best}` by {points:.1f}" for data, (best, points) in self.behind.items())
-        lost = f" Behind, in points: {lost}." if lost else ""
-        counts = f"ahead on {len(self.ahead)}, behind on {len(self.behind)}, intervals overlap on"
-        return f"{counts} {len(self.overlapping)} of {total} sets.{lost}"
-
 
 class Rates:
     """Success rates and times of a results file, by data set and solver."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from figures import paper_figures, plot_real_matches, plot_reliability, plot_sweep
+from figures import grouped, paper_figures, plot_real_matches, plot_reliability, plot_sweep
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matches import MATCHES, overview, page_facts, title
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
@@ -45,14 +45,6 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, An
     chosen = [row for row in rows if row["set"] in sets and row["solver"].partition(":")[0] in SUMMARY_SOLVERS]
     found = grouped(chosen, "solver")
     return dict(sorted(found.items(), key=lambda x: (x[0] != ANY, -x[1][0]["success"]["rate"])))
-
-
-def grouped(rows: Iterable[Mapping[str, Any]], key: str) -> dict[str, list[Mapping[str, Any]]]:
-    """Rows by one of their entries."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        found.setdefault(row[key], []).append(row)
-    return found
 
 
 def rigs(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
