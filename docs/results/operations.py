@@ -89,7 +89,7 @@ _ELEMENTWISE = {
         ("rsqrt", SQRT + DIVIDE),
         ("hypot", SQRT + ADD + 2 * MULTIPLY),
         ("logit", LOG + ADD + DIVIDE),
-        ("exp expm1", EXP),
+        ("exp exp2 expm1", EXP),
         ("acos atan2 cos lgamma log log1p sin tanh", LOG),
         ("sigmoid", EXP + ADD + DIVIDE),
         ("addcmul", MULTIPLY + ADD),

@@ -94,7 +94,7 @@ _OFF = 0.05
 # The required number of points off the line is the number of inliers minus this number, at least 1, at most 3.
 _FEW = 5
 # Rounds of the robust fit of the line, and squarings of the covariance for its first eigenvector.
-_LINE_ROUNDS, _SQUARINGS = 3, 3
+_LINE_ROUNDS, _SQUARINGS = 3, 2
 
 
 class Votes(NamedTuple):
@@ -166,8 +166,9 @@ class Mixture(NamedTuple):
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Relative densities (B, N) of inliers, of inliers with the components divided by 1 and 9, and of outliers."""
-        scaled = exponent / self.variance
-        narrow, wide = scaled.exp(), (scaled / _WIDE).exp()
+        # `exp2` is faster than `exp`, which takes 50 times as long on a CPU where the result underflows (MKL).
+        scaled = exponent / (math.log(2.0) * self.variance)
+        narrow, wide = scaled.exp2(), (scaled / _WIDE).exp2()
         share = _TAIL / (1.0 - _TAIL) / _WIDE
         inlier, weighted = (torch.add(narrow, wide, alpha=x) for x in (share, share / _WIDE))
         return inlier, weighted, (self.variance / self.share - self.variance) * outlier
@@ -367,20 +368,21 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
 
     Points on a line leave one rotation free, so that a few outliers can determine this rotation by chance.
     """
-    weights = there = inliers.to(world_points.dtype)[..., None]  # (B, N, 1)
-    tiny = torch.finfo(weights.dtype).tiny
+    world, inliers = world_points.permute(2, 1, 0), inliers.mT  # (3, N, B) and (N, B)
+    weights = there = inliers.to(world.dtype)
+    # Without inliers, or if all inliers are the same point, numbers are NaN, and the last comparison is False.
     for _ in range(_LINE_ROUNDS):
-        share = weights / weights.sum(1, keepdim=True).clamp(min=tiny)
-        centred = world_points - torch.bmm(share.mT, world_points)
-        matrix = torch.bmm(centred.mT, share * centred)
-        matrix = matrix / matrix.norm(dim=(1, 2), keepdim=True).clamp(min=tiny)
+        share = weights / weights.sum(0)
+        centred = world - (share * world).sum(1, keepdim=True)
+        matrix = (centred[:, None] * (share * centred)).sum(2)  # (3, 3, B)
+        matrix = matrix / matrix.amax((0, 1))
         for _ in range(_SQUARINGS):  # the direction of the line is the first eigenvector
-            matrix = torch.bmm(matrix, matrix)
-        direction = matrix.sum(-1, keepdim=True)
-        direction = direction / direction.norm(dim=1, keepdim=True).clamp(min=tiny)
-        along = torch.bmm(centred, direction)
-        sq_off = torch.baddbmm(centred, along, direction.mT, alpha=-1).square().sum(-1, keepdim=True)
-        limit = _OFF**2 * torch.bmm(share.mT, along.square())
-        weights = there / (sq_off + limit.clamp(min=tiny**0.5))
-    off = (inliers & (sq_off > limit)[..., 0]).sum(-1)
-    return off >= (inliers.sum(-1) - _FEW).clamp(1, MIN_PAIRS)
+            matrix = (matrix[:, :, None] * matrix).sum(1)
+        direction = matrix.sum(1)
+        direction = direction / direction.norm(dim=0)
+        along = (direction[:, None] * centred).sum(0)
+        sq_off = torch.addcmul(centred, direction[:, None], along, value=-1.0).square().sum(0)
+        limit = _OFF**2 * (share * along.square()).sum(0)
+        weights = there / (sq_off + limit)
+    off = (inliers & (sq_off > limit)).sum(0)
+    return off >= (inliers.sum(0) - _FEW).clamp(1, MIN_PAIRS)
