@@ -137,11 +137,12 @@ def places_in(content, path=()):
 
 
 def run_main(*arguments):
-    """Exit code and what was printed; an exception is one."""
+    """Exit code and what was printed. With the exit code 2 that is one line and no traceback."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             code = main([str(x) for x in arguments])
         except SystemExit as end:
             code = end.code
+    assert code != 2 or (err.getvalue()[:8], err.getvalue().count("\n")) == ("pnpnet: ", 1), err.getvalue()
     return code, out.getvalue(), err.getvalue()

@@ -91,43 +91,34 @@ def test_fisheyes_agree_with_opencv(uniform):
     torch.testing.assert_close(rays[..., :2] / rays[..., 2:], pixels, rtol=0, atol=1e-6)
 
 
-def test_where_there_is_no_pixel(uniform):
-    """Beyond the turning point of a polynomial, and beside a pinhole camera's plane; the rest of the problem stays."""
+def test_where_there_is_no_pixel():
+    """Beyond the turning point of a polynomial, and beside a pinhole camera's plane."""
     far = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * 0.9, 240.0]]], dtype=torch.float64)
     wide = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * 2.0, 240.0]]], dtype=torch.float64)  # 115 degrees
     turning = torch.tensor([[-0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
     for pixels, dist, fisheye in ((far, turning, None), (wide, None, 0.0 * turning)):
         _, there, _ = undistort(pixels, CAMERA[None], dist, fisheye, None)
         assert there.tolist() == [[True, False]]
-    points, pixels, pose = seen(uniform, 4, 12)
-    distorted, lens = distort(pixels, "dist")
-    distorted[:, 0] = 5000.0
-    result = create_solver("pnpnet-set")(points, distorted, CAMERA, **lens)
-    assert right(result, pose).all()
-    assert (result.weights[:, 0] == 0).all()
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm"])
 @pytest.mark.parametrize("lens", ["dist", "fisheye"])
-def test_distorted_pixels_are_solved(name, lens, uniform):
+def test_distorted_pixels_are_solved_without_those_that_no_point_has(name, lens, uniform):
     points, pixels, pose = seen(uniform, 8, 12)
     distorted, given = distort(pixels, lens)
+    distorted[:, 0] = 5000.0
     solver = create_solver(name)
     of_each = solver(points, distorted, CAMERA, **{lens: given[lens].expand(8, -1)})
     assert right(of_each, pose, 0.1, 0.01).all()
+    assert (of_each.weights[:, 0] == 0).all()
     matrices = solve_pnp(points, distorted, CAMERA, solver=solver, **given)
     torch.testing.assert_close(matrices, of_each.matrix[:, :3])
 
 
-SIGNS = [(-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)]
-
-
-@pytest.mark.parametrize("signs", [(1.0, 1.0), *SIGNS])
-def test_the_noise_goes_through_the_lens(signs, uniform):
+def test_the_noise_goes_through_the_lens(uniform):
     """As the differences of undistorted pixels; the equivalent sigma has the same mean square."""
     _, pixels, _ = seen(uniform, 2, 9)
-    flip = torch.tensor([*signs, 1.0], dtype=torch.float64)
-    pixels, dist, camera = flip[:2] * pixels, DIST.expand(2, -1), (flip[:, None] * CAMERA).expand(2, 3, 3)
+    dist, camera = DIST.expand(2, -1), CAMERA.expand(2, 3, 3)
     step = 1e-4 * torch.eye(2, dtype=torch.float64)
     moved = [[undistort(pixels + x, camera, dist, None, None)[0] for x in (axis, -axis)] for axis in step]
     jacobian = torch.stack([(ahead - back) / 2e-4 for ahead, back in moved], -1)
@@ -138,6 +129,9 @@ def test_the_noise_goes_through_the_lens(signs, uniform):
     expected = Symmetric2.of(jacobian @ cov @ jacobian.mT)
     torch.testing.assert_close(tuple(found.img_cov), tuple(expected), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.img, (0.5 * jacobian.square().sum((-1, -2))).sqrt(), rtol=1e-5, atol=1e-6)
+
+
+SIGNS = [(-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)]
 
 
 @pytest.mark.parametrize("signs", SIGNS)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from data_helpers import arrays, table
+from strategies import run_main
 
 from kornia_pnpnet import create_solver
-from kornia_pnpnet.cli import main
 from kornia_pnpnet.cli.correspondence_files import InputError
 
 pa = pytest.importorskip("pyarrow")
@@ -20,15 +20,13 @@ from kornia_pnpnet.cli.shards import solve_shards  # noqa: E402
 
 
 class Watched(Solve):
-    """Notes the sizes of the tables; the user stops the solver after some tables."""
+    """Notes the sizes of the tables."""
 
-    def __init__(self, name, after=100):
+    def __init__(self, name):
         super().__init__(name)
-        self.after, self.sizes = after, []
+        self.sizes = []
 
     def __call__(self, part):
-        if len(self.sizes) == self.after:
-            raise KeyboardInterrupt
         self.sizes.append(len(part))
         return super().__call__(part)
 
@@ -68,19 +66,6 @@ def test_a_shard_is_read_in_batches_and_keeps_other_columns(shards, tmp_path, ma
     assert solve.sizes == [5, 5, 5, 5, 3]
     assert found.column_names == ["id", *OUTPUTS]
     assert found["id"].to_pylist() == [*range(23)]
-
-
-def test_it_goes_on_with_the_first_shard_without_a_result(shards, solve, tmp_path):
-    folder, _ = shards
-    out = tmp_path / "out"
-    with pytest.raises(KeyboardInterrupt):
-        solve_shards(Watched("reppnp", after=2), [folder], out, name="reppnp")
-    assert sorted(x.name for x in out.iterdir()) == ["part0.parquet", "part1.parquet"]
-    before = (out / "part0.parquet").stat().st_mtime_ns
-    assert solve_shards(solve, [folder], out, name="reppnp")[2:] == (1, 2, [])
-    assert (out / "part0.parquet").stat().st_mtime_ns == before
-    assert solve_shards(solve, [folder], out, name="reppnp", overwrite=True).shards == 3
-    assert (out / "part0.parquet").stat().st_mtime_ns > before
 
 
 def test_results_of_another_solver_are_not_taken_for_its_own(shards, solve, tmp_path):
@@ -152,19 +137,23 @@ def test_sources_that_are_no_shards(shards, solve, tmp_path):
         assert {x.name: x.read_bytes() for x in folder.iterdir()} == before
 
 
-def test_the_command(shards, tmp_path, capsys):
+def test_the_command(shards, tmp_path):
     folder, _ = shards
-    command = ["solve", "--batch", str(folder), "--out", str(tmp_path / "out"), "--solver", "reppnp"]
-    assert main(command) == 0
-    assert "of 21 problems in 3 shards solved" in capsys.readouterr().out
+    command = "solve", "--batch", folder, "--out", tmp_path / "out", "--solver", "reppnp"
+    code, out, _ = run_main(*command)
+    assert code == 0
+    assert "of 21 problems in 3 shards solved" in out
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
     (folder / "z.npz").write_bytes(b"")
-    assert main(command) == 2
-    out, err = capsys.readouterr()
+    code, out, err = run_main(*command)
+    assert code == 2
     assert "3 shards had been solved before" in out
     assert "z.npz" in err
-    for wrong in (["solve", str(folder / "part0.npz"), str(folder / "part1.npz")], [*command, "--plot", "x.png"]):
-        assert main(wrong) == 2
-        assert "--batch" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == before
+    for wrong in (("solve", folder / "part0.npz", folder / "part1.npz"), (*command, "--plot", "x.png")):
+        code, _, err = run_main(*wrong)
+        assert code == 2
+        assert "--batch" in err
 
 
 # `getrusage` may include the memory of the parent process.

@@ -88,13 +88,6 @@ def test_align_finds_a_similarity(random_rotations, generator):
 # --- systems ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def systems(generator):
-    """Positive definite matrices (20, 6, 6) and right sides (20, 6)."""
-    root = torch.randn(20, 6, 8, generator=generator, dtype=torch.float64)
-    return root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
-
-
 def test_a_singular_system_in_its_range_has_a_finite_solution():
     matrix = torch.zeros(3, 3, 1, dtype=torch.float64)
     matrix[:2, :2] = 1.0
@@ -106,10 +99,10 @@ def test_a_singular_system_in_its_range_has_a_finite_solution():
 
 
 @pytest.mark.usefixtures("few")
-def test_damped_systems_are_solved(systems):
+def test_damped_systems_are_solved(generator):
     """One that is singular and one that is no number have the solution 0, with finite gradients, and harm no other."""
-    matrix, rhs = systems
-    matrix = matrix.clone()
+    root = torch.randn(20, 6, 8, generator=generator, dtype=torch.float64)
+    matrix, rhs = root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
     matrix[3], matrix[4], matrix[5, 2, 2] = torch.nan, torch.ones(6, 6), -1.0
     damping = torch.linspace(0.0, 2.0, 20, dtype=torch.float64)
     damping[3:6] = 0.0
@@ -139,7 +132,8 @@ def test_gradients_are_finite_for_any_size_of_the_matrix(count):
 KINDS = {2: Symmetric2, 3: Symmetric3}
 
 
-def matrices(size, count=200, eigenvalues=None):
+def matrices(size, eigenvalues=None):
+    count = 200
     generator = torch.Generator().manual_seed(size)
     turn = torch.linalg.qr(torch.randn(count, size, size, generator=generator, dtype=torch.float64)).Q
     values = 10.0 ** (4.0 * torch.rand(count, size, generator=generator, dtype=torch.float64) - 2.0)

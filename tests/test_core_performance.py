@@ -41,62 +41,56 @@ def problems(count, n=9, dtype=torch.float64):
     return SyntheticProblems(n=n, batch_size=count, seed=5, outliers=OutlierMix(), dtype=dtype).batch(0)
 
 
+def assert_compiled_is_eager(solver, compiled, batch, rtol=1e-6, atol=1e-6, gradients=False):
+    """Two solvers have the same results and, on request, the same gradients."""
+    results, derivatives = [], []
+    for net in (solver, compiled):
+        inputs = [x.clone().requires_grad_(gradients) for x in batch[:3]]
+        with torch.set_grad_enabled(gradients):
+            result = net(*inputs, cam_from_rig=batch.cam_from_rig)
+        results.append(result)
+        if gradients:
+            total = sum(x.sum() for x in (result.rotation, result.weights, result.cost, result.init.translation))
+            derivatives.append(torch.autograd.grad(total, [*inputs, *net.parameters()], materialize_grads=True))
+            assert derivatives[-1][0].any()
+    assert_same(*results[::-1], rtol=rtol, atol=atol)
+    if gradients:
+        assert_same(*derivatives[::-1], rtol=1e-4, atol=atol)
+
+
 @pytest.mark.parametrize(
-    ("name", "views", "whole", "cameras"),
+    ("name", "views", "whole", "cameras", "gradients"),
     [
-        ("pnpnet-n9", 2, False, 1),
+        ("pnpnet-n9", 2, False, 1, False),
+        ("pnpnet-n9", 2, True, 1, True),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
             for case in (
-                ("pnpnet-n9", 3, True, 1),
-                *((name, 1, False, 1) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "pnpnet-set")),
-                *(("pnpnet-set", 1, whole, 3) for whole in (False, True)),
+                ("pnpnet-n9", 3, True, 1, False),
+                ("pnpnet-n9", 1, False, 1, True),
+                *((name, 1, False, 1, False) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "pnpnet-set")),
+                *(("pnpnet-set", 1, whole, 3, False) for whole in (False, True)),
             )
         ),
     ],
 )
-def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, cameras, backend):
+def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, cameras, gradients, backend):
     # The set's softmax and the search for rigs round otherwise in a graph, and some of their parts run on demand.
     is_set = name == "pnpnet-set"
-    solvers = [
-        create_solver(name, m=12 if is_set else 2, views=views, effort="fixed" if is_set else None) for _ in "ab"
-    ]
-    tolerance = 1e-6 if not is_set else 1e-4 if cameras == 1 else 1e-3
-    solvers[1].compile(whole=whole)
-    graphs = 0
-    with torch.no_grad():
-        for count in (64, 7, 5, 1):
-            p = problems(count)
-            if cameras > 1:
-                options = {"outlier_share": 0.25, "cameras": cameras, "dtype": torch.float64}
-                p = CameraProblems(n=12, batch_size=count, seed=5, **options).batch(0)
-            results = [solver(*p[:3], cam_from_rig=p.cam_from_rig) for solver in solvers]
-            assert_same(*results, rtol=tolerance, atol=tolerance)
-            graphs = graphs or backend.frame_count
-    assert backend.frame_count == (1 if whole else graphs)
-
-
-@pytest.mark.parametrize(("views", "whole"), [pytest.param(1, False, marks=pytest.mark.slow), (2, True)])
-def test_results_and_gradients_are_those_of_the_eager_solver(views, whole, backend):
-    solver = create_solver("pnpnet-n9", m=1).double().requires_grad_()
-    solver.views = views
+    solver = create_solver(name, m=12 if is_set else 2, views=views, effort="fixed" if is_set else None)
+    solver.double().requires_grad_(gradients)
     compiled = copy.deepcopy(solver)
     compiled.compile(whole=whole)
-    for count in (4, 1):
-        results, leaves = [], []
-        for net in (solver, compiled):
-            net.zero_grad()
-            world, img, intrinsics = (x.clone().requires_grad_() for x in problems(count)[:3])
-            result = net(world, img, intrinsics)
-            of_result = result.rotation.sum() + result.weights.sum() + result.cost.sum()
-            (of_result + result.init.translation.sum()).backward()
-            results.append(result)
-            leaves.append([world, img, intrinsics, *net.parameters()])
-        assert_same(*results[::-1], rtol=1e-6, atol=1e-6)
-        assert leaves[0][0].grad.any()
-        for a, b in zip(*leaves, strict=True):
-            torch.testing.assert_close(a.grad, b.grad)
-    assert not whole or backend.frame_count == 1
+    tolerance = 1e-6 if not is_set else 1e-4 if cameras == 1 else 1e-3
+    graphs = 1 if whole else 0
+    for count in (64, 7, 5, 1):
+        p = problems(count)
+        if cameras > 1:
+            options = {"outlier_share": 0.25, "cameras": cameras, "dtype": torch.float64}
+            p = CameraProblems(n=12, batch_size=count, seed=5, **options).batch(0)
+        assert_compiled_is_eager(solver, compiled, p, tolerance, tolerance, gradients)
+        graphs = graphs or backend.frame_count
+    assert backend.frame_count == graphs
 
 
 @pytest.mark.parametrize("whole", [pytest.param(False, marks=pytest.mark.slow), True])
@@ -192,14 +186,12 @@ def test_inductor_computes_the_same(whole):
     compiled = copy.deepcopy(solver)
     compiled.compile(whole=whole)
     for count in (50, 31, 1):
-        inputs = problems(count, n=6)[:3]
-        with torch.no_grad():
-            assert_same(compiled(*inputs), solver(*inputs), rtol=1e-6, atol=1e-8)
+        assert_compiled_is_eager(solver, compiled, problems(count, n=6), atol=1e-8)
     grads = []
     for net in (solver, compiled):
         result = net(*problems(50, n=6)[:3])
-        (result.rotation.sum() + result.init.translation.sum()).backward()
-        grads.append([p.grad for p in net.parameters()])
+        total = result.rotation.sum() + result.init.translation.sum()
+        grads.append(torch.autograd.grad(total, list(net.parameters())))
     assert_same(*grads, rtol=1e-4, atol=1e-6)
 
 

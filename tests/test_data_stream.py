@@ -28,33 +28,20 @@ def make_source(kind=SyntheticProblems, **options):
     return kind(n=6, batch_size=5, seed=3, outliers=OutlierMix(), known_noise=0.5, img_sigma=(0.5, 5.0), **options)
 
 
-@pytest.mark.parametrize(("workers", "dtype"), [(0, torch.float32), (1, torch.float64), (2, torch.float32)])
-def test_batches_are_those_of_the_source_in_order(workers, dtype):
-    source = make_source(dtype=dtype)
+@pytest.mark.parametrize(
+    ("workers", "source"),
+    [
+        (0, make_source()),
+        (1, make_source(dtype=torch.float64)),
+        (2, make_source()),
+        (1, VaryingSize(SyntheticProblems, n=[4, 7], batch_size=6, seed=3)),
+    ],
+)
+def test_batches_are_those_of_the_source_in_order(workers, source):
     found = [same(problems, source.batch(4 + i)) for i, problems in enumerate(stream_batches(source, 4, 25, workers))]
     assert found == [True] * 21
     assert list(stream_batches(source, 3, 3, workers)) == []
     assert not multiprocessing.active_children()
-
-
-def test_workers_draw_batches_of_different_sizes():
-    source = VaryingSize(SyntheticProblems, n=[4, 7], batch_size=6, seed=3)
-    assert all(same(problems, source.batch(i)) for i, problems in enumerate(stream_batches(source, 0, 12, 1)))
-
-
-LEFT_OPEN = """
-from kornia_pnpnet.data import SyntheticProblems
-from kornia_pnpnet.data.stream import stream_batches
-stream = stream_batches(SyntheticProblems(n=6, batch_size=5), 0, 10**9, workers=2)
-for problems in stream:
-    break
-print("end")
-"""
-
-
-def test_a_stream_that_is_left_open_does_not_keep_the_process():
-    done = subprocess.run([sys.executable, "-c", LEFT_OPEN], capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout == "end\n"
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -79,24 +66,26 @@ def test_a_signal_to_the_group_does_not_end_the_workers(number):
     assert rest == [True] * 29
 
 
-SPAWNED = """
-import multiprocessing, torch
+LEFT_OPEN = """
+import multiprocessing, sys, torch
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.data.stream import stream_batches
 
 if __name__ == "__main__":
-    multiprocessing.set_start_method("spawn")
+    multiprocessing.set_start_method(sys.argv[1])
     source = SyntheticProblems(n=6, batch_size=5)
-    for index, problems in enumerate(stream_batches(source, 0, 12, 1)):
-        assert torch.equal(problems.img_points, source.batch(index).img_points), index
-    print("batches", index + 1)
+    stream = stream_batches(source, 0, 10**9, workers=2)
+    for index in range(12):
+        assert torch.equal(next(stream).img_points, source.batch(index).img_points), index
+    print("end")
 """
 
 
-@pytest.mark.slow
-def test_spawned_processes_draw_the_same(tmp_path):
-    """As on systems that cannot fork."""
-    script = tmp_path / "spawned.py"
-    script.write_text(SPAWNED)
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240, check=False)
-    assert (done.returncode, done.stdout) == (0, "batches 12\n"), done.stderr
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_a_stream_that_is_left_open_does_not_keep_the_process(method, tmp_path):
+    """Processes that are spawned, as on systems that cannot fork, draw the same problems."""
+    script = tmp_path / "left_open.py"
+    script.write_text(LEFT_OPEN)
+    command = [sys.executable, str(script), method]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    assert (done.returncode, done.stdout) == (0, "end\n"), done.stderr

@@ -2,23 +2,16 @@
 
 import pytest
 import torch
-from helpers import assert_same, rate
+from helpers import assert_same, rate, reprojection_errors
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from laws import BAD, Case, make_bad, take
 from strategies import finite
-from torch.func import jacrev, vmap
 
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliers, KnownInliersAndNoise
-from kornia_pnpnet.result import Problems
+from kornia_pnpnet.result import Pose, Problems
 
 BOUNDS = (KnownInliers, KnownInliersAndNoise)
-
-
-def pixels(rotation, translation, world_points, intrinsics):
-    """World points (*, N, 3) in the image, (*, N, 2)."""
-    projected = (world_points @ rotation.mT + translation) @ intrinsics.mT
-    return projected[..., :2] / projected[..., 2:]
 
 
 @pytest.mark.parametrize("bound", BOUNDS)
@@ -36,9 +29,8 @@ def test_the_pose_minimises_the_weighted_squares_of_the_inliers(make_problems, b
     assert torch.equal(result.weights > 0, problems.inliers)
     assert result.ok.all()
     turn, shift = torch.zeros(2, 5, 3, dtype=torch.float64).requires_grad_()
-    rotation = axis_angle_to_rotation_matrix(turn) @ result.rotation
-    where = pixels(rotation, (result.translation + shift)[:, None], problems.world_points, problems.intrinsics)
-    costs = (result.weights.detach() * (where - problems.img_points).square().sum(-1)).sum(-1)
+    pose = Pose(axis_angle_to_rotation_matrix(turn) @ result.rotation, result.translation + shift)
+    costs = (result.weights.detach() * reprojection_errors(problems, pose).square().sum(-1)).sum(-1)
     # A radian moves pixels by thousands, so that a gradient of this size is rounding.
     for gradient in torch.autograd.grad(costs.sum(), (turn, shift)):
         assert gradient.abs().max() < 1e-6 * costs.max()
@@ -47,16 +39,15 @@ def test_the_pose_minimises_the_weighted_squares_of_the_inliers(make_problems, b
 def test_weights_are_inverse_variances_by_the_jacobian(make_problems):
     problems = make_problems(batch=3, outliers=1)
     camera = torch.tensor([[800.0, 0, 320], [0, 950, 240], [0, 0, 1]], dtype=torch.float64)
-    pose = problems.pose.rotation, problems.pose.translation[:, None]
-    img_points = pixels(*pose, problems.world_points, camera)
-    problems = problems._replace(intrinsics=camera.expand(3, 3, 3), img_points=img_points)
+    problems = problems._replace(intrinsics=camera.expand(3, 3, 3))
+    problems = problems._replace(img_points=problems.img_points + reprojection_errors(problems))
     weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(problems).weights
 
-    def project(point, rotation, translation):
-        return pixels(rotation, translation, point[None], camera)[0]
+    def pixels(world_points):
+        return reprojection_errors(problems._replace(world_points=world_points))
 
-    jacobian = vmap(vmap(jacrev(project), in_dims=(0, None, None)))(problems.world_points, *pose)  # (B, N, 2, 3)
-    variance = 2.0**2 + 0.3**2 * jacobian.square().sum((-2, -1)) / 2.0
+    jacobian = torch.autograd.functional.jacobian(pixels, problems.world_points)  # (B, N, 2, B, N, 3)
+    variance = 2.0**2 + 0.3**2 * jacobian.square().sum((-4, -3, -2, -1)) / 2.0
     torch.testing.assert_close(weights.detach(), torch.where(problems.inliers, 1.0 / variance, 0.0))
 
 
