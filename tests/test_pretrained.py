@@ -46,7 +46,8 @@ def test_success_on_problems_that_nothing_else_uses(name, n, floors, dtype):
         assert rate(solve(solver, problems), problems) >= floor
     if name != "pnpnet-set":
         assert rate(solve(create_solver(f"net-n{n}"), sound), sound) < floors[0] / 2
-    garbage = sound._replace(img_points=sound.img_points.roll(1, 0))  # every pixel belongs to another problem
+    few = sound.map(lambda x: x[:400])  # the search for a pose of garbage takes long
+    garbage = few._replace(img_points=few.img_points.roll(1, 0))  # every pixel belongs to another problem
     assert solve(solver, sound).ok.float().mean() > 0.99
     assert solve(solver, garbage).ok.float().mean() < 0.1
 
