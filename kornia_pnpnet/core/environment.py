@@ -27,8 +27,8 @@ def environment() -> dict[str, Any]:
 
     Returns:
         ``versions`` by package (``None`` if not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
-        ``gpu`` (``None`` without a GPU), ``date`` in UTC, ``behaviour`` (``BEHAVIOUR``), and the git ``commit`` of the package
-        (``None`` outside a checkout). The commit ends with ``+`` if tracked files have changes.
+        ``gpu`` (``None`` without a GPU), ``date`` in UTC, ``behaviour`` (``BEHAVIOUR``), and the git ``commit`` of the
+        package (``None`` outside a checkout). The commit ends with ``+`` if tracked files have changes.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},
