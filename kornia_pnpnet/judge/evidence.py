@@ -93,8 +93,8 @@ _MOST_NOISE = 0.016
 _OFF = 0.05
 # The required number of points off the line is the number of inliers minus this number, at least 1, at most 3.
 _FEW = 5
-# Rounds of the robust fit of the line, and squarings of the covariance for its first eigenvector.
-_LINE_ROUNDS, _SQUARINGS = 3, 2
+# Rounds of the robust fit of the line.
+_LINE_ROUNDS = 3
 
 
 class Votes(NamedTuple):
@@ -376,13 +376,13 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
         centred = world - (share * world).sum(1, keepdim=True)
         matrix = (centred[:, None] * (share * centred)).sum(2)  # (3, 3, B)
         matrix = matrix / matrix.amax((0, 1))
-        for _ in range(_SQUARINGS):  # the direction of the line is the first eigenvector
-            matrix = (matrix[:, :, None] * matrix).sum(1)
-        direction = matrix.sum(1)
+        # The direction of the line is the first eigenvector. The fourth power of the matrix maps ones close to it.
+        matrix = (matrix[:, :, None] * matrix).sum(1)
+        direction = (matrix * matrix.sum(1)).sum(1)
         direction = direction / direction.norm(dim=0)
         along = (direction[:, None] * centred).sum(0)
         sq_off = torch.addcmul(centred, direction[:, None], along, value=-1.0).square().sum(0)
-        limit = _OFF**2 * (share * along.square()).sum(0)
-        weights = there / (sq_off + limit)
-    off = (inliers & (sq_off > limit)).sum(0)
+        sq_length = (share * along.square()).sum(0)
+        weights = there / torch.add(sq_off, sq_length, alpha=_OFF**2)
+    off = (inliers & (sq_off > _OFF**2 * sq_length)).sum(0)
     return off >= (inliers.sum(0) - _FEW).clamp(1, MIN_PAIRS)
