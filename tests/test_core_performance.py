@@ -14,7 +14,7 @@ from torch import nn
 from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from kornia_pnpnet import MLPInit, PnPNet, Pose, RobustWeightedLM, create_solver
+from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, create_solver
 from kornia_pnpnet.core.performance import INLINE, Runner, ascending_order, in_order, in_turn, ranked
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 

@@ -4,12 +4,13 @@ import math
 import shutil
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import torch._inductor.config
+from helpers import assert_same
 from kornia.core.exceptions import BaseError, ShapeError, ValueCheckError
 
 from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, SetInit, create_solver
@@ -22,20 +23,7 @@ CPP = Path(__file__).resolve().parents[1] / "docs" / "examples" / "cpp"
 
 def inputs_of(problems, weights=None):
     weights = torch.ones_like(problems.world_points[..., 0]) if weights is None else weights
-    return tuple(x.float() for x in (*problems[:3], weights))
-
-
-def rigs(n, batch):
-    """Inputs of a solver for rigs."""
-    problems = CameraProblems(n=n, batch_size=batch, seed=5, cameras=3, outlier_share=0.25).batch(0)
-    return *inputs_of(problems), *problems.cam_from_rig
-
-
-def broken(problems):
-    """Problems of which the fourth, if there is one, has NaN."""
-    world = problems.world_points.clone()
-    world[3:4, 1] = torch.nan
-    return problems._replace(world_points=world)
+    return *(x.float() for x in (*problems[:3], weights)), *(problems.cam_from_rig or ())
 
 
 def near(found, solver, inputs):
@@ -55,29 +43,6 @@ def near(found, solver, inputs):
     assert cost.isfinite().all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "n", "counts"),
-    [
-        ("pnpnet-n9", None, (9,)),
-        ("epnp-lm", 9, (9,)),
-        ("reppnp-lm", 9, (9,)),
-        ("identity-lm", 9, (9,)),
-        ("pnpnet-set", 9, (9,)),
-        ("pnpnet-set", None, (4, 5, 9, 17, 18, 30, 40, 200)),
-    ],
-)
-def test_programs(name, n, counts, make_problems):
-    solver = create_solver(name)
-    program = export_program(solver, n)
-    for count in counts:
-        for batch in (2, 50):
-            # With outliers EPnP ends on the edge of two minima so often that rounding decides.
-            outliers = 0 if name == "epnp-lm" else count // 4
-            inputs = inputs_of(make_problems(n=count, batch=batch, outliers=outliers))
-            near(program.module()(*inputs), solver, inputs)
-
-
 def run_onnx(path, inputs):
     runtime = pytest.importorskip("onnxruntime")
     session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
@@ -86,28 +51,70 @@ def run_onnx(path, inputs):
     return session.run(None, {name: x.numpy() for name, x in zip(RIG_INPUTS, inputs, strict=False)})
 
 
+def packaged(folder, solver, n, **options):
+    if shutil.which("g++") is None and shutil.which("clang++") is None:
+        pytest.skip("no C++ compiler")
+    return export_package(solver, folder / "model.pt2", n, **options)
+
+
+def exported(kind, solver, folder, n, **options):
+    """The function of an exported solver."""
+    if kind == "program":
+        return export_program(solver, n, **options).module()
+    if kind == "onnx":
+        path = export_onnx(solver, folder / "model.onnx", n, **options)
+        return lambda *inputs: run_onnx(path, inputs)
+    package = load_package(packaged(folder, solver, n, **options))
+    return lambda *inputs: package(*inputs[:4], cam_from_rig=Pose(*inputs[4:]) if inputs[4:] else None)
+
+
+PROGRAMS = "pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm", "pnpnet-set"
+#: Kind, solver, number of pairs and size of the batch of the export; then those of problems, and whether it is a rig.
+EXPORTS = [
+    *(("program", name, 9, None, ((9, 2), (9, 50)), False) for name in PROGRAMS),
+    ("program", "pnpnet-set", None, None, [*product((4, 5, 9, 17, 18, 30, 40, 200), (2, 50))], False),
+    ("program", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
+    ("onnx", "pnpnet-n9", None, None, ((9, 1), (9, 3), (9, 100)), False),
+    ("onnx", "pnpnet-set", None, None, ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)), False),
+    ("onnx", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
+    ("package", "identity-lm", 9, 1, ((9, 1),), False),
+    ("package", "identity-lm", 9, None, ((9, 1), (9, 3), (9, 100)), False),
+    ("package", "identity-lm", None, None, ((6, 3), (9, 1), (40, 2), (20, 50)), False),
+    ("package", "set-lm", 12, None, ((12, 1), (12, 50)), True),
+    ("package", "identity-lm", (12, 8), 2, [(n, 2) for n in (4, 5, 8, 9, 12)], False),
+    ("package", "epnp", (12, 8), 2, [(n, 2) for n in (4, 5, 8, 9, 12)], True),
+]
+
+
 @pytest.mark.parametrize(
-    ("name", "fixed", "sizes"),
+    ("kind", "name", "n", "batch", "sizes", "is_rig"),
     [
-        ("one iteration", 4, ((9, 4),)),
-        pytest.param("one iteration", None, ((9, 4),), marks=pytest.mark.slow),
-        pytest.param("pnpnet-n9", None, ((9, 1), (9, 3), (9, 100)), marks=pytest.mark.slow),
-        pytest.param("pnpnet-set", None, ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)), marks=pytest.mark.slow),
+        ("onnx", "identity-lm", 9, 4, ((9, 4),), False),
+        *(pytest.param(*export, marks=pytest.mark.slow) for export in EXPORTS),
     ],
 )
-def test_onnx(name, fixed, sizes, make_problems, tmp_path):
-    """Batches of any size, with padding where any number of correspondences is allowed, and with a broken problem."""
-    solver = PnPNet(None, RobustWeightedLM(1)) if name == "one iteration" else create_solver(name)
-    path = export_onnx(solver, tmp_path / "model.onnx", 9 if name == "one iteration" else None, batch=fixed)
-    for count, batch in sizes:
-        problems = broken(make_problems(n=count, batch=batch, outliers=count // 4))
+def test_exports(kind, name, n, batch, sizes, is_rig, make_problems, tmp_path):
+    """Batches of any size, with padding where any number of pairs is allowed, and with a broken problem."""
+    solver = PnPNet(SetInit(), RobustWeightedLM(2, kernel="huber")) if name == "set-lm" else create_solver(name)
+    solver = PnPNet(None, RobustWeightedLM(1)) if name == "identity-lm" else solver
+    run = exported(kind, solver, tmp_path, n, batch=batch, rig=is_rig)
+    for count, size in sizes:
+        # With outliers EPnP ends on the edge of two minima so often that rounding decides.
+        outliers = 0 if name.startswith("epnp") else count // 4
+        problems = make_problems(n=count, batch=size, outliers=outliers)
+        if is_rig:
+            problems = CameraProblems(n=count, batch_size=size, seed=5, cameras=3, outlier_share=0.25).batch(0)
+        else:
+            problems.world_points[3:4, 1] = torch.nan
         weights = torch.ones_like(problems.world_points[..., 0])
-        weights[:, 4:5] = 0.0 if name == "pnpnet-set" else 1.0
+        weights[:, 4:5] = 0.0 if name == "pnpnet-set" and n is None else 1.0
         inputs = inputs_of(problems, weights)
-        found = run_onnx(path, inputs)
+        before = [x.clone() for x in inputs]
+        found = run(*inputs)
         near(found, solver, inputs)
-        assert all(np.isfinite(x).all() for x in found[:4])
-        assert not found[4][3:4].any()
+        assert all(torch.as_tensor(x).isfinite().all() for x in found[:4])
+        assert is_rig or not found[4][3:4].any()
+        torch.testing.assert_close(inputs, tuple(before), rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.slow
@@ -166,74 +173,22 @@ def test_what_an_export_needs_is_checked_before_it_starts(name, missing, tmp_pat
 # -- ahead-of-time packages --------------------------------------------------------------------------------------------
 
 
-def packaged(folder, solver, n, **options):
-    if shutil.which("g++") is None and shutil.which("clang++") is None:
-        pytest.skip("no C++ compiler")
-    return export_package(solver, folder / "model.pt2", n, **options)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("n", "batch", "sizes"),
-    [(9, 1, ((9, 1),)), (9, None, ((9, 1), (9, 3), (9, 100))), (None, None, ((6, 3), (9, 1), (40, 2), (20, 50)))],
-)
-def test_packages(n, batch, sizes, make_problems, tmp_path):
-    """Tensors of other dtypes and layouts than the package was compiled for, and a broken problem."""
-    solver = PnPNet(None, RobustWeightedLM(1))
-    package = load_package(packaged(tmp_path, solver, n, batch=batch))
-    assert (package.sizes, package.batch) == (() if n is None else (n,), batch)
-    for count, size in sizes:
-        inputs = inputs_of(broken(make_problems(n=count, batch=size, outliers=count // 4)))
-        found = package(*inputs)
-        assert found._fields == OUTPUTS
-        near(found, solver, inputs)
-        assert all(x.isfinite().all() for x in found[:4])
-        assert not found.ok[3:4].any()
-        transposed = [x.double().mT.contiguous().mT for x in inputs[:3]]
-        for ours, again in zip(package(*inputs[:3]), package(*transposed), strict=True):
-            assert torch.equal(ours, again)
-    world, img, intrinsics, weights = inputs_of(make_problems(n=9, batch=batch or 3))
-    wrong = [(world[:, :3], img[:, :3], intrinsics), (world, img[:, :8], intrinsics), (world[0], img, intrinsics)]
-    wrong += [(world, img, intrinsics, weights[:, :8]), (world, img, intrinsics[:0])]
-    for inputs in wrong:
-        with pytest.raises(ShapeError):
-            package(*inputs)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rig", [False, True])
-def test_a_package_for_several_numbers_of_pairs_pads(rig, make_problems, tmp_path):
-    solver = create_solver("epnp") if rig else PnPNet(None, RobustWeightedLM(1))
-    package = load_package(packaged(tmp_path, solver, (12, 8), batch=2, rig=rig))
-    assert package.sizes == (8, 12)
-    for n in (4, 5, 8, 9, 12):
-        inputs = rigs(n, 2) if rig else inputs_of(make_problems(n=n, batch=2))
-        before = [x.clone() for x in inputs]
-        found = package(*inputs[:4], cam_from_rig=Pose(*inputs[4:]) if rig else None)
-        assert found.pair_weights.shape == (2, n)
-        near(found, solver, inputs)
-        assert all(torch.equal(x, y) for x, y in zip(inputs, before, strict=True))
-    for n in (2, 13):
-        world, img, intrinsics, _ = inputs_of(make_problems(n=n, batch=2))
+def test_what_a_package_takes(make_problems, tmp_path):
+    """Tensors of other dtypes and layouts than the package was compiled for, but no other shapes."""
+    package = load_package(packaged(tmp_path, PnPNet(None, RobustWeightedLM(1)), (12, 8), batch=2))
+    assert (package.sizes, package.batch) == ((8, 12), 2)
+    world, img, intrinsics, weights = inputs_of(make_problems(n=13, batch=2))
+    inputs = world[:, :9], img[:, :9], intrinsics
+    found = package(*inputs)
+    assert found._fields == OUTPUTS
+    assert_same(package(*(x.double().mT.contiguous().mT for x in inputs)), found)
+    wrong = [(world[:, :n], img[:, :n], intrinsics) for n in (2, 13)]
+    wrong += [(inputs[0], img[:, :8], intrinsics), (inputs[0][0], *inputs[1:]), (*inputs[:2], intrinsics[:0])]
+    wrong += [(*inputs, weights[:, :8])]
+    for refused in wrong:
         with pytest.raises((ShapeError, ValueCheckError)):
-            package(world, img, intrinsics)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["program", "onnx", "package"])
-def test_rigs(kind, tmp_path):
-    solver = PnPNet(SetInit(), RobustWeightedLM(2, kernel="huber"))
-    sizes = ((5, 3), (12, 1), (12, 50), (70, 10))
-    if kind == "program":
-        run = export_program(solver, rig=True).module()
-    elif kind == "onnx":
-        path = export_onnx(solver, tmp_path / "model.onnx", rig=True)
-        run = lambda *inputs: run_onnx(path, inputs)  # noqa: E731
-    else:
-        package, sizes = load_package(packaged(tmp_path, solver, 12, rig=True)), ((12, 1), (12, 50))
-        run = lambda *inputs: package(*inputs[:4], cam_from_rig=Pose(*inputs[4:]))  # noqa: E731
-    for size in sizes:
-        near(run(*rigs(*size)), solver, rigs(*size))
+            package(*refused)
 
 
 @pytest.mark.slow
