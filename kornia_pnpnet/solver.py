@@ -300,8 +300,8 @@ class PnPNet(PretrainedMixin):
         """Compile the solver in place with ``torch.compile``: the first stage, an iteration, and the final stage.
 
         The first call compiles for some seconds. A new number of pairs, a new dtype, or gradients cause a new
-        compilation. A new batch size does not. Parts that cannot be compiled (RANSAC, or all parts without a C++
-        compiler) run uncompiled after one warning. A copy of the solver compiles again.
+        compilation. A new batch size does not. Parts that cannot be compiled (RANSAC; all parts without a C++
+        compiler or before PyTorch 2.13) run uncompiled after one warning. A copy of the solver compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.

@@ -13,6 +13,7 @@ from helpers import assert_same
 from torch import nn
 from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.torch_version import TorchVersion
 
 from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, create_solver
 from kornia_pnpnet.core.performance import INLINE, Runner, ascending_order, in_order, in_turn, ranked
@@ -115,6 +116,15 @@ def test_without_a_compiler_it_runs_as_it_is(when, monkeypatch):
         assert run(torch.neg, torch.ones(1)) == -1
     assert len(caught) == 1
     assert run(torch.neg, torch.ones(1)) == -1
+
+
+def test_an_older_pytorch_runs_it_as_it_is(monkeypatch):
+    solver = create_solver("pnpnet-n9")
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.11.0+cu130"))
+    with pytest.warns(RuntimeWarning, match=r"running uncompiled.*2\.13, got 2\.11\.0") as caught:
+        solver.compile()
+    assert len(caught) == 1
+    assert solver(*problems(3)[:3]).ok.shape == (3,)
 
 
 def test_too_little_memory_is_no_failure_of_the_compiler(monkeypatch):

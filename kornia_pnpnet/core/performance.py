@@ -255,6 +255,10 @@ class Runner:
     """
 
     def __init__(self, compiled: bool = False, mode: str | None = None) -> None:
+        if compiled and torch.__version__ < "2.13":
+            reason = f"Compilation needs PyTorch 2.13, got {torch.__version__}."
+            warnings.warn(f"Not compiled, running uncompiled. {reason}", RuntimeWarning, stacklevel=3)
+            compiled = False
         self.compiled, self.mode = compiled, mode
         self.failed: set[str] = set()  # names of functions whose compilation failed
         # Keys of `_functions`: name of the function, and whether problems have at least `_MANY_PAIRS` pairs.
