@@ -262,7 +262,9 @@ class PnPNet(PretrainedMixin):
         if self.focal == "unknown" and (rig or dist is not None or fisheye is not None):
             raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
         if rig and (alternatives or (self.init is None and inputs.init is None)):
-            raise ValueCheckError("Rigs and bearings need an initialiser or `init`, and do not support alternatives.")
+            raise ValueCheckError(
+                "`cam_from_rig` and bearings need an initialiser or `init`, and do not support alternatives."
+            )
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
         with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points):
             compiled = self._run.compiled or self._whole.compiled
