@@ -103,6 +103,7 @@ def plot(runs: dict[str, Any], path: Path) -> None:
     for name, run in runs.items():
         axes.plot(run["error_px"], color=COLOURS[name], linewidth=1.7, label=name)
     axes.set(xlabel="step", ylabel="error of the learned offsets (px)", yscale="log")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_title(f"{WRONG:.0%} of the keypoints anywhere", loc="left")
     axes.legend(frameon=False)
     save(figure, path)

@@ -1,9 +1,11 @@
-"""The picture of the home page: a synthetic house, the pairs that ``pnpnet-set`` rejects, and the pose it finds."""
+"""The picture of the home page: a house, the pairs that ``pnpnet-set`` rejects, and the pose that it finds."""
 
+import itertools
 import math
 from pathlib import Path
 
 import torch
+from house import HALF_WIDTH, OPENINGS, photograph
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
@@ -15,6 +17,7 @@ from kornia_pnpnet.evaluation.plots import BLUE, GREY, VERMILION, WIDTH, make_fi
 _PAIRS, _OUTLIERS, _SEED = 48, 20, 3
 _KEPT = 0.5  # weights above this count as inliers, as on the page about OpenCV
 _HALF_VIEW = 0.31  # tangent of half the field of view that is drawn
+_PHOTO = 560  # pixels across the photograph
 _CAMERA = 4.0  # metres; length of a drawn camera
 _VIEWPOINT = {"elev": 20.0, "azim": -60.0}  # degrees
 
@@ -26,6 +29,7 @@ _CORNERS = torch.tensor(
 )
 _BOX = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
 _EDGES = torch.tensor([*_BOX, (4, 8), (7, 8), (5, 9), (6, 9), (8, 9)])
+_IN_SIGHT = _CORNERS[torch.tensor([(0, 1), (1, 2), (0, 4), (1, 5), (2, 6), (4, 5), (4, 8), (5, 9), (6, 9), (8, 9)])]
 _PLACE = torch.tensor([0.0, 3.2, 21.0], dtype=torch.float64)  # metres; the house in the camera's frame
 _TURNS = ((0.2, 0.0, 0.0), (0.0, 0.65, 0.0))  # radians; the camera looks down, and at a corner
 
@@ -36,9 +40,22 @@ def _in_camera(points: Tensor) -> Tensor:
     return points @ (down @ around).mT + _PLACE
 
 
+def _seen_edges() -> Tensor:
+    """The ends of the edges in sight, of the house, its windows and its door, shape (E, 2, 3)."""
+    ends = []
+    for front, openings in enumerate(OPENINGS):
+        for centre, bottom, top in openings:
+            left, right = centre - HALF_WIDTH, centre + HALF_WIDTH
+            outline = (left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)
+            corners = [(x, -up, -3.0) if front else (4.0, -up, x) for x, up in outline]
+            ends += list(itertools.pairwise(corners))
+    return torch.cat((_IN_SIGHT, torch.tensor(ends, dtype=torch.float64)))
+
+
 def _house_points(batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-    """Points on the edges of the house, see :class:`kornia_pnpnet.data.PointPrior`."""
-    edges = _CORNERS[_EDGES[torch.randint(len(_EDGES), (batch_size, n), generator=generator)]]  # (B, n, 2, 3)
+    """Points on edges of the house, see :class:`kornia_pnpnet.data.PointPrior`."""
+    edges = _seen_edges()
+    edges = edges[torch.randint(len(edges), (batch_size, n), generator=generator)]  # (B, n, 2, 3)
     along = torch.rand((batch_size, n, 1), generator=generator, dtype=torch.float64)
     return _in_camera(torch.lerp(edges[..., 0, :], edges[..., 1, :], along))
 
@@ -74,11 +91,12 @@ def plot_problem(path: str | Path) -> Path:
     figure = make_figure(WIDTH, 3.3)
     image, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
     pixels, projected, edge = problem.img_points[0], seen(world), _HALF_VIEW * problem.intrinsics[0, 0, 0].item()
-    for ends in seen(house)[_EDGES]:
-        image.plot(*ends.T, color=GREY, linewidth=1.0)
+    turned = _in_camera(torch.eye(3, dtype=torch.float64)) - _PLACE
+    photo = photograph(turned.mT.numpy(), _PLACE.numpy(), _HALF_VIEW, _PHOTO)
+    image.imshow(photo, extent=(-edge, edge, edge, -edge), interpolation="bilinear")
     for start, end in zip(pixels[~kept], projected[~kept], strict=True):
-        image.plot(*torch.stack((start, end)).T, color=VERMILION, linewidth=0.8, alpha=0.45)
-    image.plot(*pixels[kept].T, "o", color=BLUE, markersize=5.5)
+        image.plot(*torch.stack((start, end)).T, color=VERMILION, linewidth=0.8, alpha=0.7)
+    image.plot(*pixels[kept].T, "o", color=BLUE, markersize=5.5, markeredgecolor="white")
     image.plot(*pixels[~kept].T, "x", color=VERMILION, markersize=7.5, markeredgewidth=2.2)
     image.set(xlim=(-edge, edge), ylim=(edge, -edge), aspect="equal", xticks=(), yticks=())
     for spine in image.spines.values():
@@ -91,7 +109,7 @@ def plot_problem(path: str | Path) -> Path:
     space.plot(*upright(world[~kept]).T, "x", color=VERMILION, markersize=5.5, markeredgewidth=1.8)
     space.plot(*upright(_frustum(truth)).T, color=GREY, linewidth=5.0)
     space.plot(*upright(_frustum(result.pose)).T, color="black", linewidth=1.5)
-    drawn = upright(torch.cat((world, _frustum(truth))))
+    drawn = upright(torch.cat((house, _frustum(truth))))
     low, high = drawn.amin(0), drawn.amax(0)
     space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     space.set_box_aspect((high - low).tolist(), zoom=1.45)
