@@ -160,6 +160,7 @@ def page(results: Rows, gpu: Row | None = None) -> str:
 
 # Line styles by the end of a contender's name. Other names have a dashed line.
 _WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}
+_NOT_DRAWN = " compiled", " ONNX", "p3p-ransac"  # of the single calls, whose table has all contenders
 _LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowest
 
 
@@ -174,6 +175,7 @@ def plot_times(path: Path, title: str, panels: Mapping[str, Sequence[Row]], *, a
 @themed
 def plot_latency(path: Path, title: str, rows: Sequence[Row]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
+    rows = [row for row in rows if not row["contender"].endswith(_NOT_DRAWN)]
     looks = _looks(row["contender"] for row in rows)
     figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()

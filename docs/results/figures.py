@@ -50,6 +50,19 @@ _LOOKS = {
     "known-inliers": ("k", "", "-."), "known-inliers-and-noise": ("k", "", ":"),
 }
 # fmt: on
+# A picture of curves has at most _MOST solvers. Those with these beginnings of a name come first; tables have them all.
+_MOST = 8
+_FIRST = (
+    "pnpnet",
+    "poselib",
+    "opencv-ransac",
+    "pycolmap",
+    "p3p-ransac",
+    "epnp-lm",
+    "kornia",
+    "known-inliers",
+    "opencv",
+)
 _OTHERS = [(colour, "d", line) for line in ("-", "--", ":") for colour in ("#882255", "#44AA99", "#999933", "#6644AA")]
 _LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters that a piece of line takes
 _ROW = 0.165  # inches from one solver to the next: a line of letters
@@ -147,6 +160,12 @@ def draw_dots(path: str | Path, heading: Sequence[str], panels: Sequence[Panel])
     return save(figure, path)
 
 
+def _most_important(names: Iterable[str]) -> set[str]:
+    """The names of the solvers that a picture shows."""
+    ranks = {name: [name.startswith(beginning) for beginning in (*_FIRST, "")].index(True) for name in names}
+    return set(sorted(ranks, key=lambda name: (ranks[name], name))[:_MOST])
+
+
 @themed
 def draw_curves(
     path: str | Path, heading: Sequence[str], panels: Sequence[Panel], x: str, styles: Styles | None = None
@@ -156,7 +175,7 @@ def draw_curves(
     A panel is a title, a table with the column ``solver``, and the name of the column on its vertical axis: ``rate`` in
     per cent (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
     """
-    found = {solver for _, table, _ in panels for solver in table.solver}
+    found = _most_important({solver for _, table, _ in panels for solver in table.solver})
     styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
     heights = 1.0 + 0.04 * len(styles), 2.4 if len(panels) > 4 else 3.0
     figure, grid, columns = make_panels(len(panels), 4, heights, heading)
