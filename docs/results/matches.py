@@ -85,18 +85,17 @@ def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     rows = [*ours, *sorted(shown, key=lambda name: -pooled[name]["all"].success.rate)]
     short = {"ratio test": "filtered", "no ratio test": "raw"}
     rates = [pooled[name][kind].success for name in rows for kind in kinds]
-    ahead = []
+    ahead = {}
     for kind in kinds:
         base, alone = pooled[ours[0]][kind], single[ours[0]][kind]
         better = {
-            "solving more": [x for x in shown if pooled[x][kind].success.rate > base.success.rate],
-            "faster": [x for x in shown if pooled[x][kind].ms < base.ms],
-            "faster with one image per call": [x for x in shown if single[x][kind].ms < alone.ms],
+            "more solved": [x for x in shown if pooled[x][kind].success.rate > base.success.rate],
+            "faster than its batches": [x for x in shown if pooled[x][kind].ms < base.ms],
+            "faster than its single calls": [x for x in shown if single[x][kind].ms < alone.ms],
         }
-        for what, found in better.items():
-            names = dict.fromkeys(name.partition(",")[0] for name in found)
-            ahead += [f"{' and '.join(names)} {what} on {short[kind]} matches"] if names else []
-    there = ((f"`{ANY}` in batches of {BATCH}", batched[ours[0]]), (best[0], single[best[0]]))
+        names = {what: dict.fromkeys(name.partition(",")[0] for name in found) for what, found in better.items()}
+        ahead[short[kind]] = "; ".join(f"{what}: {', '.join(who)}" for what, who in names.items() if who) or "nobody"
+    there = ((f"`{ANY}` in batches", batched[ours[0]]), (best[0], single[best[0]]))
     return {
         **{"rows": rows, "ours": ours, "kinds": kinds, "short": short, "scores": SCORES, "batch": BATCH},
         **{"pooled": pooled, "single": single, "batched": batched, "microseconds": microseconds},
