@@ -71,15 +71,17 @@ def heatmap_keypoints(
     check_form(["*", "N", "H", "W"], heatmaps=heatmaps)
     KORNIA_CHECK(0 not in heatmaps.shape[-2:], f"A heat map needs at least one cell, got {tuple(heatmaps.shape)}.")
     check_positive(stride=stride)
+    tensors = {"heatmaps": heatmaps}
     if isinstance(temperature, Tensor):
-        check_devices({"temperature": temperature}, heatmaps, "heatmaps")
+        tensors["temperature"] = temperature
+        check_devices(tensors, heatmaps, "heatmaps")
         sizes = zip(temperature.shape[::-1], heatmaps.shape[::-1], strict=False)
         fits = all(size in (1, other) for size, other in sizes)
         shapes = f"{tuple(temperature.shape)} and {tuple(heatmaps.shape)}"
         KORNIA_CHECK(fits, f"temperature must broadcast to the shape of heatmaps, got {shapes}.")
     else:
         check_positive(temperature=temperature)
-    logits = heatmaps.to(common_dtype({"heatmaps": heatmaps})) / temperature
+    logits = heatmaps.to(common_dtype(tensors)) / temperature
     check_shapes({"heatmaps / temperature": (logits, tuple(heatmaps.shape))})
     *size, height, width = heatmaps.shape
     share = spatial_softmax2d(logits.reshape(heatmaps.shape[:-3].numel(), *heatmaps.shape[-3:]))

@@ -8,7 +8,7 @@ import torch
 from helpers import derivative, rate, verified_derivative, verify_jacobian
 from torch import nn
 
-from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, gravity_prior
+from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, Status, create_solver, gravity_prior
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine.residual import project, retract
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm
@@ -140,6 +140,17 @@ def test_a_prior_without_information_is_a_start_alone(name, make_problems):
     solver = create_solver(name)
     found, expected = solver(*problems[:3], prior=nothing), solver(*problems[:3], init=problems.pose)
     torch.testing.assert_close(found.matrix, expected.matrix)
+
+
+@pytest.mark.parametrize("size", [1e-20, 1.0, 1e20])
+def test_information_beside_a_zero_of_the_diagonal_is_refused_in_every_unit(size, make_problems):
+    problems = make_problems(n=9, batch=2, outliers=0)
+    information = torch.diag(torch.tensor([100.0, 0.0, 100.0, 0.0, 0.0, 0.0], dtype=torch.float64)).repeat(2, 1, 1)
+    information[0, 4, 3] = 1e-5 / size**2
+    pose = Pose(problems.pose.rotation, size * problems.pose.translation)
+    prior = PosePrior(pose, information)
+    result = create_solver("epnp-lm")(size * problems.world_points, *problems[1:3], prior=prior)
+    assert result.status.tolist() == [Status.NOT_FINITE, Status.SOLVED]
 
 
 def test_what_is_known_helps_and_what_is_wrong_hardly_harms(make_problems, generator):

@@ -253,10 +253,16 @@ def _open_axis(information: Tensor) -> Tensor:
 
 
 def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
-    """Ascending eigenvalues (B, 6) after scaling to a unit diagonal, and whether each matrix is symmetric, (B,)."""
-    diagonal = information.detach().double().diagonal(dim1=1, dim2=2)
-    size = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
-    scaled = information.detach().double() * size[:, :, None] * size[:, None]
+    """Ascending eigenvalues (B, 6) after scaling to a unit diagonal, and whether each matrix is symmetric, (B,).
+
+    An entry 0 of the diagonal takes the scale of the largest entry with the same unit, so that rounding errors in its
+    row stay small. If all these entries are 0, their rows must be 0.
+    """
+    information = information.detach().double()
+    diagonal = information.diagonal(dim1=1, dim2=2)
+    largest = diagonal.unflatten(1, (2, 3)).amax(-1, keepdim=True).expand(-1, -1, 3).flatten(1)
+    size = torch.where(diagonal > 0, diagonal, largest).rsqrt()
+    scaled = torch.where(information == 0, 0.0, information * size[:, :, None] * size[:, None])
     scaled = scaled.nan_to_num(math.inf)
     off = (scaled - scaled.mT).abs().amax((1, 2))
     bounded = torch.where(scaled.isfinite().all((1, 2))[:, None, None], scaled, 0.0)
