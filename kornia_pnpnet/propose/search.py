@@ -50,6 +50,8 @@ _IMPROVED = 3
 _VECTOR = 64
 # Squared ratio of the thresholds to the narrower thresholds of a rival.
 _NARROWER = 16.0
+# The product of a rotation and of its Newton step is 3. A matrix whose product differs by this number is no rotation.
+_FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step, small because the start is close to the minimum.
 _DAMPING = 1e-6
 # Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
@@ -130,6 +132,9 @@ class Search:
         pose, camera = self._state(self.poses.to(self.problem.weights))
         # One Newton step towards the closest orthogonal matrix doubles the number of correct digits.
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
+        # The solution of a degenerate sample, such as rays that rounding makes equal, can be far from a rotation.
+        is_rotation = ((rotation * pose.rotation).sum((1, 2), keepdim=True) - 3.0).abs() < _FAR_FROM_ROTATION
+        rotation = torch.where(is_rotation, rotation, torch.eye(3, dtype=rotation.dtype, device=rotation.device))
         return State(Pose(rotation, pose.translation), camera)
 
     def run(self, given: Pose | None = None, enough: float = -1.0) -> Tensor:
