@@ -33,8 +33,9 @@ _DTYPE = torch.float32
 _SAMPLES_AT_ONCE = 8192
 # A round has _GROWTH times as many samples as all earlier rounds together, at most _LARGEST_ROUND.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
-# A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds.
-_ROUNDS_LEFT = 2
+# A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds, or are at most _FEW_SAMPLES. The pose of
+# few pairs then does not depend on their order, and rounding does not decide when the search ends.
+_ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
 # After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, at least _FIRST_PAIRS. If k
 # samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then 3 / w pairs
 # contain at least one inlier with a probability of 95 %.
@@ -251,7 +252,8 @@ class Search:
     def _sizes_of_round(self, done: int) -> tuple[int, int]:
         """Number of samples in the next round, and largest number of remaining samples that are drawn in one round."""
         size = min(max(self.plan.min_samples, int(_GROWTH * done)), _LARGEST_ROUND)
-        return size, min(_ROUNDS_LEFT * size, _LARGEST_ROUND)
+        most = max(_ROUNDS_LEFT * size, _FEW_SAMPLES if self.problem.free_focal is None else 0)
+        return size, min(most, _LARGEST_ROUND)
 
     def _draw(self, problems: Tensor, start: int, stop: int) -> None:
         """Solve the samples ``start`` to ``stop - 1`` of some problems, and store better poses."""
