@@ -15,7 +15,7 @@ import torch
 
 #: Number of changes of the poses, ``ok`` or ``probability`` of solvers. Raise the number with each such change,
 #: so that a test can find results files that are too old. Files without a number were measured before the first change.
-BEHAVIOUR = 2
+BEHAVIOUR = 1
 
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
 # Distributions of OpenCV on PyPI, the most common distribution first.
