@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.data.draws import batch_generator, random_poses
-from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, make_figure, save, themed
+from kornia_pnpnet.evaluation.plots import BLUE, GREEN, ORANGE, log_scale, make_figure, save, themed
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.result import Pose
 
@@ -102,8 +102,8 @@ def plot(runs: dict[str, Any], path: Path) -> None:
     axes = figure.subplots()
     for name, run in runs.items():
         axes.plot(run["error_px"], color=COLOURS[name], linewidth=1.7, label=name)
-    axes.set(xlabel="step", ylabel="error of the learned offsets (px)", yscale="log")
-    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set(xlabel="step", ylabel="error of the learned offsets (px)")
+    log_scale(axes, "y")
     axes.set_title(f"{WRONG:.0%} of the keypoints anywhere", loc="left")
     axes.legend(frameon=False)
     save(figure, path)

@@ -52,17 +52,7 @@ _LOOKS = {
 # fmt: on
 # A picture of curves has at most _MOST solvers. Those with these beginnings of a name come first; tables have them all.
 _MOST = 8
-_FIRST = (
-    "pnpnet",
-    "poselib",
-    "opencv-ransac",
-    "pycolmap",
-    "p3p-ransac",
-    "epnp-lm",
-    "kornia",
-    "known-inliers",
-    "opencv",
-)
+_FIRST = "pnpnet", "poselib", "opencv-ransac", "pycolmap", "p3p-ransac", "epnp-lm", "kornia", "known-inliers", "opencv"
 _OTHERS = [(colour, "d", line) for line in ("-", "--", ":") for colour in ("#882255", "#44AA99", "#999933", "#6644AA")]
 _LETTERS, _HANDLE = 112, 11  # of a legend: letters across the page, and letters that a piece of line takes
 _ROW = 0.165  # inches from one solver to the next: a line of letters

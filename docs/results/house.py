@@ -21,15 +21,24 @@ _AMBIENT = 0.42
 _OVERSAMPLED = 3  # rays across a pixel
 _TEXELS = 1024  # side of the texture of noise
 _RNG = np.random.default_rng(2)
-_OCTAVES = (
-    cv2.resize(_RNG.random((k, k)), (_TEXELS, _TEXELS), interpolation=cv2.INTER_CUBIC) for k in (8, 32, 128, 512)
-)
-_NOISE = sum(weight * octave for weight, octave in zip((0.4, 0.3, 0.2, 0.1), _OCTAVES, strict=True))
+_OCTAVES = [
+    weight * cv2.resize(_RNG.random((k, k)), (_TEXELS, _TEXELS), interpolation=cv2.INTER_CUBIC)
+    for weight, k in ((0.4, 8), (0.3, 32), (0.2, 128), (0.1, 512))
+]
+_NOISE = np.sum(_OCTAVES, 0)
 _COLOURS = {
-    **{"brick": (0.58, 0.29, 0.20), "mortar": (0.66, 0.62, 0.56), "tile": (0.34, 0.30, 0.31)},
-    **{"frame": (0.90, 0.89, 0.85), "glass": (0.16, 0.21, 0.27), "door": (0.20, 0.33, 0.28)},
-    **{"zenith": (0.28, 0.49, 0.80), "horizon": (0.78, 0.87, 0.95), "cloud": (0.97, 0.97, 0.97)},
-    **{"grass": (0.27, 0.40, 0.15), "path": (0.62, 0.58, 0.51), "trees": (0.13, 0.22, 0.11)},
+    "brick": (0.58, 0.29, 0.20),
+    "mortar": (0.66, 0.62, 0.56),
+    "tile": (0.34, 0.30, 0.31),
+    "frame": (0.90, 0.89, 0.85),
+    "glass": (0.16, 0.21, 0.27),
+    "door": (0.20, 0.33, 0.28),
+    "zenith": (0.28, 0.49, 0.80),
+    "horizon": (0.78, 0.87, 0.95),
+    "cloud": (0.97, 0.97, 0.97),
+    "grass": (0.27, 0.40, 0.15),
+    "path": (0.62, 0.58, 0.51),
+    "trees": (0.13, 0.22, 0.11),
 }
 _RGB = {name: np.array(colour) for name, colour in _COLOURS.items()}
 
@@ -37,7 +46,8 @@ _RGB = {name: np.array(colour) for name, colour in _COLOURS.items()}
 def _noise(x: Floats, y: Floats, size: float) -> Floats:
     """Noise in [0, 1] that repeats after ``size``."""
     at = [np.floor(value / size * _TEXELS).astype(int) % _TEXELS for value in (y, x)]
-    return np.asarray(_NOISE)[at[0], at[1]]
+    noise: Floats = _NOISE[at[0], at[1]]
+    return noise
 
 
 def _blend(colour: Floats, name: str, where: NDArray[np.bool_] | Floats) -> Floats:
@@ -57,7 +67,7 @@ def _rows_of_blocks(along: Floats, up: Floats, width: float, height: float) -> t
     """Blocks in rows that are moved by half a block: a random number of each, and the position inside, in metres."""
     row = np.floor(up / height)
     moved = along / width + 0.5 * (row % 2)
-    number = np.asarray(_NOISE)[(row * 37).astype(int) % _TEXELS, (np.floor(moved) * 61).astype(int) % _TEXELS]
+    number = _NOISE[(row * 37).astype(int) % _TEXELS, (np.floor(moved) * 61).astype(int) % _TEXELS]
     return number, (moved % 1.0) * width, up - row * height
 
 
@@ -129,7 +139,7 @@ def photograph(rotation: Floats, translation: Floats, half_view: float, side: in
     lit = np.where((into < out) & (out > 1e-3) & ~seen, 0.0, np.clip(normal @ sun, 0.0, None))
     colour = colour * (_AMBIENT * np.array([0.85, 0.95, 1.15]) + 1.15 * lit[:, None] * np.array([1.0, 0.95, 0.85]))
     haze = np.clip(to_ground / 400.0, 0.0, 0.3)[:, None]
-    colour = np.where((ground & ~seen)[:, None], (1.0 - haze) * colour + haze * _RGB["horizon"] * 0.8, colour)
+    colour = np.where(ground[:, None], (1.0 - haze) * colour + haze * _RGB["horizon"] * 0.8, colour)
     colour = np.where((seen | ground)[:, None], colour, _sky(rays))
     colour *= (1.0 - 0.9 * (across**2 + down**2))[:, None]  # vignette
     image = colour.reshape(side * _OVERSAMPLED, side * _OVERSAMPLED, 3)
