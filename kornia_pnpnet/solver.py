@@ -263,7 +263,7 @@ class PnPNet(PretrainedMixin):
             raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
         if rig and (alternatives or (self.init is None and inputs.init is None)):
             raise ValueCheckError(
-                "`cam_from_rig` and bearings need an initialiser or `init`, and do not support alternatives."
+                "`cam_from_rig` and bearings as `img_points` need an initialiser or `init`, and exclude `alternatives`."
             )
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
         with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points):
