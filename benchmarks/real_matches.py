@@ -455,7 +455,8 @@ def draw_failure(matches: Matches, solved: Solved, at: int, folder: Path) -> dic
     mask, problem = matches.mask[at], take(matches.problems, torch.tensor(at))
     world, pixels = problem.world_points[mask], problem.img_points[mask]
     poses = {"reference pose": problem.pose, "pose that was found": take(solved.pose, torch.tensor(at))}
-    figure = make_figure(WIDTH, 3.1)
+    figure = make_figure(WIDTH, 3.4)
+    figure.set_layout_engine("compressed")  # for axes of equal aspect
     panels, fits = figure.subplots(1, 2, sharex=True, sharey=True), []
     for axes, (title, pose) in zip(panels, poses.items(), strict=True):
         seen = reproject(world[None], problem.intrinsics, map_tensors(lambda x: x[None], pose))[0]

@@ -42,28 +42,27 @@ def test_a_block_stands_between_its_lines():
         render.with_block("before", "new")
 
 
-def matches_file(solvers, counts=(100, 300)):
-    """A file of real matches: success in per cent and milliseconds of each solver, for two kinds of matches."""
+def test_kinds_of_matches_are_summed_by_the_number_of_problems():
+    solvers = {
+        "pnpnet-set": (90, 80, 2.0),
+        "poselib:threshold=6": (70, 70, 4.0),
+        "poselib:threshold=6+ratio": (65, 71, 4.0),
+    }
     rows = [
-        {"solver": name, "kind": kind, "group": "all", "count": count, "success": rate / 100, "ms_per_problem": ms}
+        {"solver": name, "kind": kind, "group": group, "batch": size, "count": count, "success": rate / 100}
+        | {"ms_per_problem": ms * count}
         for name, (*rates, ms) in solvers.items()
-        for kind, count, rate in zip(("few", "many"), counts, rates, strict=True)
+        for kind, count, rate in zip(("few", "many"), (100, 300), rates, strict=True)
+        for group, size in (("all", 1), ("all", 500), ("0–30 %", 500))
     ]
-    return {"rows": rows, "settings": {"solvers": list(solvers)}}
-
-
-def test_measurements_are_pooled_by_the_number_of_problems_and_by_what_the_solver_did():
-    peer = "poselib:threshold=6"
-    first = {"pnpnet-set:effort=adaptive": (90, 80, 2.0), "pnpnet-set": (80, 60, 1.0), peer: (70, 70, 4.0)}
-    second = {"pnpnet-set": (70, 60, 4.0), "pnpnet-set:effort=fixed": (60, 40, 1.0), peer: (70, 70, 8.0)}
-    second["pycolmap:threshold=8"] = (50, 50, 1.0)  # which the first file lacks
-    pooled = matches.pool([matches_file(first), matches_file(second, (300, 100))])
-    adaptive, fixed, other = pooled.values()  # in the order of the first file
-    assert [adaptive[kind].success.rate for kind in ("few", "many", "all")] == [0.75, 0.75, 0.75]
-    assert [fixed[kind].success.rate for kind in ("few", "many")] == [0.65, 0.55]
-    assert (adaptive["all"].ms, fixed["few"].ms, other["all"].ms) == (3.0, 1.0, 6.0)
-    assert adaptive["all"].success.total == 800
-    assert matches.points_ahead(pooled) == pytest.approx(0.05)
+    file = matches.at_size({"rows": rows})
+    assert {(row["batch"], row["group"]) for row in file["rows"]} == {(500, "all"), (500, "0–30 %")}
+    found = matches.totals(file)
+    ours = found["pnpnet-set"]
+    assert [ours[kind].success.rate for kind in ("few", "many", "all")] == [0.9, 0.8, 0.825]
+    assert (ours["few"].ms, ours["all"].ms, ours["all"].success.total) == (200.0, 500.0, 400)
+    assert matches.best_peer(found) == "poselib:threshold=6"
+    assert matches.points_ahead(found) == pytest.approx(12.5)
 
 
 def test_a_solver_is_ahead_or_behind_only_when_intervals_are_apart():

@@ -478,7 +478,7 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
 
 _RAW_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
     "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
-    "=adaptive": {"marker": "^"},
+    "=fixed": {"marker": "^"},
 }
 
 

@@ -1,8 +1,7 @@
 """The page on real matches and the overview of the home page, from what ``benchmarks/real_matches.py`` wrote."""
 
-import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -14,148 +13,127 @@ from rates import read_summary
 
 from kornia_pnpnet.metrics import SuccessRate, success_rate
 
-#: Files of ``benchmarks/real_matches.py measure``, each on scenes that no solver had seen, the latest last.
-MATCHES = ("real_matches", "real_matches_again", "real_matches_third", "real_matches_fourth")
-#: The file of ``benchmarks/real_matches.py measure --batch 1`` on some of these scenes: one image in each call.
-SINGLE = "real_matches_single"
-BATCH = 500  # problems in a call of ours in the files of MATCHES
+#: Files of ``benchmarks/real_matches.py measure``: scenes that no solver had seen, and scenes that we had looked at, on
+#: which the options of other libraries were chosen.
+UNSEEN, SEEN = "real_matches", "real_matches_seen"
+BATCH = 500  # problems in a call of ours
 SCORES = "scores"  # end of the title of a solver that got a score for each pair
+WITH_SCORES = f"{ANY}+ratio"
 _TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known"}
 _KNOWN = {"": "", "ratio": SCORES, "sigma": "noise known"}
 
 
-def title(solver: str, settings: Mapping[str, Any]) -> str:
-    """The name of a solver for tables.
-
-    The first file was measured when the fixed effort was the default of ``pnpnet-set``: it names the adaptive one.
-    """
+def title(solver: str) -> str:
+    """The name of a solver for tables."""
     spec, _, known = solver.partition("+")
     name, _, options = spec.partition(":")
     parts = [_TITLES.get(name, name if name == "pycolmap" else f"`{name}`")]
-    if name == ANY:
-        fixed_by_default = any("effort=adaptive" in other for other in settings["solvers"])
-        fixed = "effort=fixed" in options or (fixed_by_default and not options)
-        parts += ["fixed effort"] if fixed else []
+    parts += ["fixed effort"] if "effort=fixed" in options else []
     parts += [f"{pixels} px" for pixels in re.findall(r"threshold=(\d+)", options)]
+    parts += ["few samples"] if "max_iterations=10000," in f"{options}," else []
     return ", ".join(filter(None, (*parts, _KNOWN[known])))
 
 
-class Pooled(NamedTuple):
-    """One solver on the problems of one kind of several files: success, and milliseconds per problem."""
+class Total(NamedTuple):
+    """One solver on the problems of one kind: success, and milliseconds per problem."""
 
     success: SuccessRate
     ms: float
 
 
-def pool(files: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Pooled]]:
-    """The solvers that all files have, by title and kind of matches; over both kinds together as ``all``."""
-    rows = pd.concat([pd.DataFrame(one["rows"]).assign(file=i) for i, one in enumerate(files)], ignore_index=True)
-    rows = rows[rows.group == "all"]
-    names = [title(solver, files[i]["settings"]) for solver, i in zip(rows.solver, rows.file, strict=True)]
-    rows = rows.assign(name=names, right=rows["count"] * rows.success, ms=rows["count"] * rows.ms_per_problem)
-    found: dict[str, dict[str, Pooled]] = {}
-    for name, one in rows.groupby("name", sort=False):
-        if one.file.nunique() == len(files):
-            kinds = [*one.groupby("kind", sort=False), ("all", one)]
-            sums = {kind: part[["count", "right", "ms"]].sum() for kind, part in kinds}
-            found[str(name)] = {
-                str(kind): Pooled(success_rate(torch.arange(int(x["count"])) < round(x.right)), x.ms / x["count"])
-                for kind, x in sums.items()
-            }
+def at_size(results: Mapping[str, Any], size: int = BATCH) -> dict[str, Any]:
+    """A file with the rows of one number of problems in a call of ours."""
+    return {**results, "rows": [row for row in results["rows"] if row["batch"] == size]}
+
+
+def totals(results: Mapping[str, Any]) -> dict[str, dict[str, Total]]:
+    """The solvers of a file, by name and kind of matches; over both kinds together as ``all``."""
+    rows = pd.DataFrame([row for row in results["rows"] if row["group"] == "all"])
+    rows = rows.assign(right=rows["count"] * rows.success, ms=rows["count"] * rows.ms_per_problem)
+    found: dict[str, dict[str, Total]] = {}
+    for name, one in rows.groupby("solver", sort=False):
+        kinds = [*one.groupby("kind", sort=False), ("all", one)]
+        sums = {kind: part[["count", "right", "ms"]].sum() for kind, part in kinds}
+        found[str(name)] = {
+            str(kind): Total(success_rate(torch.arange(int(x["count"])) < round(x.right)), x.ms / x["count"])
+            for kind, x in sums.items()
+        }
     return found
 
 
-def best_peer(pooled: Mapping[str, Mapping[str, Pooled]]) -> str:
+def best_peer(found: Mapping[str, Mapping[str, Total]]) -> str:
     """The PoseLib with the highest success."""
-    peers = [name for name in pooled if name.startswith("PoseLib")]
-    return max(peers, key=lambda name: pooled[name]["all"].success.rate)
+    peers = [name for name in found if name.startswith("poselib")]
+    return max(peers, key=lambda name: found[name]["all"].success.rate)
 
 
-def overview(files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Facts of the overview on the home page and in the README: the solvers on the real matches of all files."""
-    pooled = pool(files)
-    measured = json.loads((HERE / f"{SINGLE}.json").read_text(encoding="utf-8"))
-    by_size = [[row for row in measured["rows"] if row["batch"] == size] for size in (1, BATCH)]
-    single, batched = (pool([{**measured, "rows": rows}]) for rows in by_size)
-    kinds = [kind for kind in pooled[f"`{ANY}`"] if kind != "all"]
-    ours = [f"`{ANY}`", f"`{ANY}`, {SCORES}"]
-    others = [name for name in pooled if name[0] != "`" and name != _TITLES["known-inliers"]]
-    best = [best_peer({x: pooled[x] for x in pooled if x.endswith(SCORES) == scores}) for scores in (False, True)]
-    shown = [name for name in others if not name.startswith("PoseLib") or name in best]
-    rows = [*ours, *sorted(shown, key=lambda name: -pooled[name]["all"].success.rate)]
-    short = {"ratio test": "filtered", "no ratio test": "raw"}
-    rates = [pooled[name][kind].success for name in rows for kind in kinds]
+def points_ahead(found: Mapping[str, Mapping[str, Total]], ours: str = ANY) -> float:
+    """Percentage points by which one of our solvers has more success than the best PoseLib."""
+    return 100.0 * (found[ours]["all"].success.rate - found[best_peer(found)]["all"].success.rate)
+
+
+def overview(unseen: Mapping[str, Any], seen: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts of the overview on the home page and in the README: the solvers on real matches."""
+    batched, single = (totals(at_size(unseen, size)) for size in (BATCH, 1))
+    kinds = [kind for kind in batched[ANY] if kind != "all"]
+    short = dict(zip(kinds, ("filtered", "raw"), strict=True))
+    ours = [ANY, WITH_SCORES]
+    others = [name for name in batched if title(name)[0] != "`" and title(name) != _TITLES["known-inliers"]]
+    others.sort(key=lambda name: -batched[name]["all"].success.rate)
+    rates = [batched[name][kind].success for name in (*ours, *others) for kind in kinds]
     ahead = {}
     for kind in kinds:
-        base, alone = pooled[ours[0]][kind], single[ours[0]][kind]
+        base, alone = batched[ANY][kind], single[ANY][kind]
         better = {
-            "more solved": [x for x in shown if pooled[x][kind].success.rate > base.success.rate],
-            "faster than its batches": [x for x in shown if pooled[x][kind].ms < base.ms],
-            "faster than its single calls": [x for x in shown if single[x][kind].ms < alone.ms],
+            "more solved": [x for x in others if batched[x][kind].success.rate > base.success.rate],
+            "faster than its batches": [x for x in others if batched[x][kind].ms < base.ms],
+            "faster than its single calls": [x for x in others if single[x][kind].ms < alone.ms],
         }
-        names = {what: dict.fromkeys(name.partition(",")[0] for name in found) for what, found in better.items()}
+        names = {what: dict.fromkeys(title(name).partition(",")[0] for name in who) for what, who in better.items()}
         ahead[short[kind]] = "; ".join(f"{what}: {', '.join(who)}" for what, who in names.items() if who) or "nobody"
-    there = ((f"`{ANY}` in batches", batched[ours[0]]), (best[0], single[best[0]]))
+    known = totals(at_size(seen))
     return {
-        **{"rows": rows, "ours": ours, "kinds": kinds, "short": short, "scores": SCORES, "batch": BATCH},
-        **{"pooled": pooled, "single": single, "batched": batched, "microseconds": microseconds},
-        "total": pooled[ours[0]]["all"].success.total,
-        "scenes": sum(len(results["counts"]) for results in files),
-        "right": files[0]["settings"]["right"],
+        **{"rows": [*ours, *others], "ours": ours, "kinds": kinds, "short": short, "scores": SCORES, "batch": BATCH},
+        **{"batched": batched, "single": single, "title": title, "any": ANY, "ahead": ahead},
+        "total": batched[ANY]["all"].success.total,
+        "scenes": len(unseen["counts"]),
+        "right": unseen["settings"]["right"],
         "reach": 100 * max(max(x.rate - x.low, x.high - x.rate) for x in rates),
-        "cpu": files[0]["environment"]["cpu"],
-        "few": single[ours[0]]["all"].success.total,
-        "there": {name: [microseconds(one[kind]) for kind in kinds] for name, one in there},
-        "there_cpu": measured["environment"]["cpu"],
-        "ahead": ahead,
-        "steps": [100 * points_ahead(pool([results])) for results in files],
-        "any": ANY,
+        "cpu": unseen["environment"]["cpu"],
+        "lead": {"here": points_ahead(batched), "seen": points_ahead(known)},
+        "seen_total": known[ANY]["all"].success.total,
     }
-
-
-def microseconds(one: Pooled) -> str:
-    """The time of an image for a table."""
-    return f"{1e3 * one.ms:.0f}"
-
-
-def points_ahead(pooled: Mapping[str, Mapping[str, Pooled]], ours: str = f"`{ANY}`") -> float:
-    """Difference of the success of one of our solvers and of the best PoseLib."""
-    return pooled[ours]["all"].success.rate - pooled[best_peer(pooled)]["all"].success.rate
 
 
 def page_facts(
-    files: Sequence[Mapping[str, Any]], costs: Mapping[str, Any], keypoints: Mapping[str, Any]
+    unseen: Mapping[str, Any], seen: Mapping[str, Any], costs: Mapping[str, Any], keypoints: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Facts for the template of the page on real matches.
 
-    ``files`` are the files of :data:`MATCHES`; ``benchmarks/real_matches.py`` wrote ``costs`` with ``cost``, and
-    ``benchmarks/keypoints.py`` wrote ``keypoints``.
+    ``unseen`` and ``seen`` are the files :data:`UNSEEN` and :data:`SEEN`; ``benchmarks/real_matches.py`` wrote
+    ``costs`` with ``cost``, and ``benchmarks/keypoints.py`` wrote ``keypoints``.
     """
-    first, pooled = files[0], pool(files)
-    solver = first["settings"]["solvers"][0]
-    kinds = list(dict.fromkeys(row["kind"] for row in first["rows"]))
+    first = at_size(unseen)
+    found = totals(first)
+    kinds = [kind for kind in found[ANY] if kind != "all"]
     return {
-        "first": first,
-        "solver": title(solver, first["settings"]).replace(f", {SCORES}", f" with {SCORES}"),
-        "raw": find_rows(first, kinds[1])[solver]["all"],
-        "costs": costs,
-        "kinds": kinds,
-        "pooled": dict(sorted(pooled.items(), key=lambda item: -item[1]["all"].success.rate)),
-        "peer": best_peer(pooled),
-        "files": [facts(name, results, kinds) for name, results in zip(MATCHES, files, strict=True)],
+        **{"first": first, "solver": title(ANY), "kinds": kinds, "costs": costs},
+        "raw": find_rows(first, kinds[1])[ANY]["all"],
+        "totals": dict(sorted(found.items(), key=lambda item: -item[1]["all"].success.rate)),
+        "peer": best_peer(found),
+        "files": [facts(name, at_size(one), kinds) for name, one in ((UNSEEN, unseen), (SEEN, seen))],
         "scenes": {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")},
-        "reliability": first["reliability"][solver],
+        "reliability": first["reliability"][ANY],
         "keypoints": keypoints,
         "ways": [{row["way"]: row for row in one["rows"]} for one in keypoints["results"]],
-        **{"any": f"`{ANY}`", "scores": SCORES, "points_ahead": points_ahead, "title": title},
+        **{"any": ANY, "with_scores": WITH_SCORES, "points_ahead": points_ahead, "title": title},
     }
 
 
-def facts(name: str, results: Mapping[str, Any], kinds: Iterable[str]) -> dict[str, Any]:
+def facts(name: str, results: Mapping[str, Any], kinds: list[str]) -> dict[str, Any]:
     """Facts of one file of ``measure``: its best PoseLib, and its rows by kind and solver."""
-    pooled = pool([results])
+    found = totals(results)
     shares = ["all", *(f"{100 * a:.0f}–{100 * b:.0f} %" for a, b in pairwise(results["settings"]["shares"]))]
-    total = sum(entry[kind]["counted"] for entry in results["counts"] for kind in kinds)
     tables = {kind: find_rows(results, kind) for kind in kinds}
-    found = {"name": name, "results": results, "pooled": pooled, "peer": best_peer(pooled)}
-    return {**found, "groups": shares, "tables": tables, "total": total}
+    more = {"groups": shares, "tables": tables, "total": found[ANY]["all"].success.total}
+    return {"name": name, "results": results, "totals": found, "peer": best_peer(found), **more}

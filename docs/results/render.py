@@ -8,7 +8,7 @@ from typing import Any
 
 from figures import grouped, paper_figures, plot_real_matches, plot_reliability, plot_sweep
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from matches import MATCHES, overview, page_facts, title
+from matches import SEEN, UNSEEN, at_size, overview, page_facts, title
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from problem_picture import plot_problem
 from rates import KERNEL, Rates, ablation, capacity, compare_all, interval, percent, read_summary, shown, sweep
@@ -118,11 +118,11 @@ def load(name: str, folder: Path = HERE) -> Any:
 
 def pages() -> dict[Path, str]:
     """The pages and the texts that their files hold."""
-    matches = [load(name) for name in MATCHES]
-    facts = overview(matches)
+    matches = load(UNSEEN), load(SEEN)
+    facts = overview(*matches)
     found = {HERE / "README.md": page(written("overview.md.jinja", link="real_matches.md", **facts))}
     found[HERE / "real_matches.md"] = written(
-        "real_matches.md.jinja", **page_facts(matches, load("real_matches_cost"), load("keypoints"))
+        "real_matches.md.jinja", **page_facts(*matches, load("real_matches_cost"), load("keypoints"))
     )
     for path in OVERVIEW_PAGES:
         link = Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix()
@@ -140,9 +140,9 @@ def render() -> None:
     plot_sweep(HERE / "sweep_against_n.png", HERE / "sweep.csv", against="model.n")
     plot_sweep(HERE / "sweep_against_m.png", HERE / "sweep.csv", against="model.m")
     plot_reliability(HERE / "reliability.png", load("honesty")["reliability"])
-    costs, matches = load("real_matches_cost"), load(MATCHES[0])
-    titles = {solver: title(solver, costs["settings"]).replace("`", "") for solver in costs["settings"]["solvers"]}
-    plot_real_matches(HERE / "real_matches.png", matches, costs, titles)
+    costs = load("real_matches_cost")
+    titles = {solver: title(solver).replace("`", "") for solver in costs["settings"]["solvers"]}
+    plot_real_matches(HERE / "real_matches.png", at_size(load(UNSEEN)), costs, titles)
     plot_problem(HERE / "problem.png")
     for path, text in pages().items():
         path.write_text(text, encoding="utf-8")
