@@ -143,3 +143,14 @@ def test_a_result_prints_anywhere():
 def test_the_law_is_that_of_the_results_file():
     assert list(LAW) == json.loads((ROOT / "docs" / "results" / "probability.json").read_text())["law"]
     assert math.isfinite(sum(LAW))
+
+
+def test_noise_whose_covariance_has_no_float32_determinant_harms_its_problem_only():
+    p = SyntheticProblems(n=12, batch_size=3, seed=5, dtype=torch.float32).batch(0)
+    solver, sigma = create_solver("pnpnet-set"), torch.full((3, 12), 0.1)
+    noise = {"img_cov": torch.eye(2).expand(3, 12, 2, 2), "world_sigma": sigma}
+    expected = solver(*p[:3], **noise)
+    sigma[1] = 1e9
+    found = solver(*p[:3], **noise)
+    assert found.ok.tolist() == [True, False, True]
+    assert torch.equal(found.matrix[::2], expected.matrix[::2])

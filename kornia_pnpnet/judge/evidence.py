@@ -259,7 +259,9 @@ def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
     projection = project(state, problem)
     sq_residual, precision = information(projection, problem)
     exponent = torch.where(projection.in_front, -0.5 * sq_residual, -(torch.finfo(sq_residual.dtype).max ** 0.5))
-    density = precision if isinstance(precision, Tensor) else precision.determinant.sqrt()
+    # With huge noise, the determinant underflows.
+    least = torch.finfo(sq_residual.dtype).tiny
+    density = precision if isinstance(precision, Tensor) else precision.determinant.clamp(min=least).sqrt()
     return AtPose(projection, exponent, density, votes.outlier / density, precision)
 
 

@@ -204,8 +204,8 @@ def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
     middle = _mean(problem.world_points, shares)
     centred = problem.world_points - middle[:, None]
     covariance = torch.bmm(centred.mT, shares[..., None] * centred)
-    if covariance.device.type == "cpu":
-        normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
+    if covariance.device.type == "cpu":  # LAPACK raises an error for the whole batch if one matrix has NaN
+        normal = torch.linalg.eigh(covariance.nan_to_num(0.0, 0.0, 0.0)).eigenvectors[..., 0]
     else:  # cuSOLVER takes 250 KiB for each matrix, and fails for 100,000 matrices
         normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
     seen = torch.baddbmm(pose.translation[..., None], pose.rotation, middle[..., None])
