@@ -30,7 +30,7 @@ _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
 _LARGEST_DISTANCE = 1e6
 # A confidence (such as a cosine of descriptors) may leave [0, 1] by less than this number, because of rounding.
 _ROUNDING = 1e-3
-# Tangent of 85 degrees. No real lens without distortion shows larger angles from the axis.
+# Tangent of 85 degrees. A real lens that is free of distortion does not see rays at larger angles to the axis.
 _FAR_ANGLE = 11.4
 
 

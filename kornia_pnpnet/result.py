@@ -316,7 +316,8 @@ class PnPResult(NamedTuple):
             an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
         sigma: standard deviation of a pixel coordinate, estimated from the inliers, in the caller's pixels, shape
-            :math:`(B,)`, without gradient. The estimate includes noise of the points at the usual depth.
+            :math:`(B,)`, without gradient. The estimate includes the noise of the points,
+            converted to pixels at the geometric mean of the depths.
         inliers: which pairs are inliers of the pose, bool, shape :math:`(B, N)`.
     """
 

@@ -221,7 +221,7 @@ class PnPNet(PretrainedMixin):
             cam_from_rig: the transform from a rig of several cameras to the camera of each pair,
                 :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The solved pose is then the pose of the rig.
             first_stage_only: return the first guess without refinement (the paper's "Net"), as with ``m=0``.
-            gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`; the option of the solver when ``None``.
+            gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`. ``None``: the solver's own option.
             alternatives: largest number of alternative poses to return, see
                 :class:`~kornia_pnpnet.result.Alternatives`. The search takes as long as several calls without
                 ``alternatives``.

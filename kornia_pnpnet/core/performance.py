@@ -30,7 +30,7 @@ exporting = torch.compiler.is_exporting
 
 
 def sees_values(x: Tensor) -> bool:
-    """Whether Python code may read the values. Tracing, ``torch.func.vmap`` and the device ``meta`` forbid reading."""
+    """Whether Python may read the values: not during tracing, under ``torch.func.vmap`` or on the device ``meta``."""
     if compiling():
         return False
     functorch = torch._C._functorch
@@ -68,7 +68,8 @@ if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even i
 def in_turn(x: Tensor) -> AbstractContextManager[Any]:
     """Return a context in which threads run one after the other, if ``x`` has few numbers (see :func:`are_few`).
 
-    Without turns, four threads wait for Python's lock at each operation and take 2.5 times as long as one thread.
+    If four threads do not take turns, they wait for Python's lock at each operation, and take 2.5 times as long as one
+    thread.
     """
     return _TURN[0] if are_few(x) else nullcontext()
 

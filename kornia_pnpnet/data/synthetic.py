@@ -88,8 +88,8 @@ class SyntheticProblems(RandomProblems):
             the other problems have one sigma, and each missing sigma is NaN.
         confidence_share: share of the problems that have confidences; other problems have NaN. With 0, batches have no
             confidences. The separation of inliers from outliers and the scale of the logits differ between problems.
-        bunched_share: share of the problems in which inliers, *near* and *structured* outliers form a bunch, in a part
-            of the image. The points of all other outliers come from the rest of the scene.
+        bunched_share: share of the problems in which the inliers and the *near* and *structured* outliers are bunched
+            in one part of the image. The points of all other outliers come from the rest of the scene.
         depth_maps: errors of world points that depth cameras have measured, in addition to ``world_sigma``. Known noise
             does not include these errors. ``None`` means no errors of depth cameras.
         copies_share: share of the problems with copies, as from detectors that list a place several times. In these

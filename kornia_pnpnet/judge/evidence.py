@@ -153,7 +153,8 @@ class Mixture(NamedTuple):
     """The distribution of the residuals of a problem.
 
     Attributes:
-        variance: factor of the variances of the inliers, shape (B, 1). If the problem has no noise, the unit is px².
+        variance: number by which the variances of the inliers are multiplied, shape (B, 1). If the problem has no
+            noise, the unit is px².
         share: share of inliers, shape (B, 1).
         least: lower bound of ``variance``, shape (B, 1). Without the bound, few pairs could make the variance 0.
         total: sum of the votes, shape (B, 1).

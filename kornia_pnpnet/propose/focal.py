@@ -100,7 +100,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     if radial:
         with torch.no_grad():
             problem, frame = normalize(*inputs[:5])
-            # These steps use only the prior of distortion. The refinement also uses the prior of the focal length.
+            # These steps use the prior of the distortion. The refinement also uses the prior of the focal length.
             known = known._replace(information=torch.zeros_like(zoom)).scaled(frame.img_scale)
             at = _with_distortion(problem._replace(free_focal=known), frame.apply(pose), radial)
             finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()

@@ -18,8 +18,8 @@ class Initialiser(Configured):
     Any module with this ``forward`` is an initialiser. If the module lacks an attribute, the default below applies.
 
     Attributes:
-        pairs_at_once: largest number of pairs per thread in a part of a batch. On a CPU and without gradients, solvers
-            split a batch into parts that fit the CPU's caches. ``None``: batches are not split.
+        pairs_at_once: on a CPU and without gradients, solvers split a batch into parts that fit the CPU's caches. This
+            is the largest number of pairs of a part, per thread. ``None``: batches are not split.
         fixed_pairs: whether the number of pairs has to be ``config["n"]``.
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.

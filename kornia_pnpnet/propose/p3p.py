@@ -63,7 +63,7 @@ def _greater(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Flags (C,): whether one cyclic shift, or two shifts, bring the largest of three values (3, C) to the front."""
+    """Whether one cyclic shift brings the largest of three values (3, C) to the front, and whether two do, (C,)."""
     first, second, third = values
     return _greater(second, first), _greater(third, torch.maximum(first, second))
 

@@ -31,7 +31,7 @@ _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # Least inlier threshold for an unknown focal length, divided by the median distance of the pixels from the principal
 # point and by half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# Lower bound of the depth at which `search_on` converts noise of points to pixels, in normalised units.
+# Lower bound, in normalised units, of the depth at which `search_on` converts noise of points to pixels.
 _NEAREST = 0.5
 # _DOUBT: chance that a pair of weight 0 is drawn, relative to a pair of weight 1. _LEAST_TRUST: the same ratio for
 # confidences 0 and 1. This ratio is smaller, because a caller's confidences are more reliable than a network's weights.

@@ -47,8 +47,9 @@ _ABSENT = -1e9
 # Minimal samples. Each number is the rank of a pair in descending order of likelihood. The first six samples are a
 # Turán system: if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# Each entry is a number of pairs and a factor. Problems with at least this number of pairs also have the samples above
-# with all ranks multiplied by the factor. These samples help if the likeliest pairs agree on an incorrect pose.
+# Each entry is a number of pairs and a factor. In problems with at least this number of pairs, the samples above are
+# used twice: as they are, and with all ranks multiplied by the factor. The second use helps if the likeliest pairs
+# agree on an incorrect pose.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
 # Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two samples share two pairs.
 _RING_FROM = 36

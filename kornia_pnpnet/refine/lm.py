@@ -292,7 +292,7 @@ class RobustWeightedLM(Configured):
             run: calls each part of the refinement, compiled or uncompiled.
 
         Returns:
-            The plan with the noise of the iterations by residual, and the last states.
+            The plan, with the noise that the iterations by residual used, and the last states.
         """
         m = self.m if m is None else min(m, self.m)
         each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
