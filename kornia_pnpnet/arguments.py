@@ -184,9 +184,10 @@ def _cameras(intrinsics: Tensor | PinholeCamera, size: torch.Size) -> Tensor:
 def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | None, any_number: bool) -> PnPResult:
     """Solve a batch. On a CPU, parts of the batch that fit the caches are solved one after the other.
 
-    A part has at most ``most`` pairs for each CPU thread. Parts have no limit if ``most`` is ``None`` or gradients are
-    recorded. If ``solve`` accepts ``any_number`` of pairs, problems are grouped by their number of pairs, so that parts
-    have little padding. Grouping saves a third to half of the time if the numbers differ strongly.
+    A part has at most ``most`` pairs for each CPU thread. The size of a part has no limit if ``most`` is ``None`` or
+    gradients are recorded. If ``any_number`` is true, ``solve`` accepts any number of pairs. Problems are then grouped
+    by their number of pairs, so that parts have little padding. Grouping saves a third to half of the time if the
+    numbers of pairs differ strongly.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:

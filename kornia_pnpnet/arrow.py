@@ -45,10 +45,11 @@ class Solve:
 
     Each row is a problem; the number of pairs N may differ between rows. Each cell is a list of numbers in row-major
     order: ``world_points`` (3N numbers), ``img_points`` in pixels (2N), and optionally ``intrinsics`` (9), ``weights``
-    (N), ``img_sigma`` in pixels and ``world_sigma`` in the unit of the world (N or one number; NaN: unknown).
+    (N), ``img_sigma`` in pixels, and ``world_sigma`` in the unit of the world. A sigma has N numbers or one number; NaN
+    means unknown.
 
-    The result has the columns ``rotation`` (9), ``translation`` (3), ``weights`` (N), ``cost``, ``ok`` and ``status``,
-    the name of a :class:`~kornia_pnpnet.result.Status` in lower case. Rows keep their order, and other columns of the
+    The result has the columns ``rotation`` (9), ``translation`` (3), ``weights`` (N), ``cost``, ``ok``, and ``status``
+    (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). Rows keep their order, and other columns of the
     table, for example ``id``, are kept. Numbers are float32.
 
     A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. Its status is
@@ -105,7 +106,7 @@ class Solve:
             there = np.arange(width) < counts[rows, None]  # (R, width), false for padding
             taken = {name: torch.from_numpy(x.take(rows, width)) for name, x in cells.items()}
             inputs: dict[str, Any] = {"intrinsics": self.intrinsics, **taken}
-            with torch.no_grad(), suppress(ShapeError):  # the solver does not accept this width
+            with torch.no_grad(), suppress(ShapeError):  # raised if the solver does not accept `width` pairs
                 result = self.solver(**inputs, mask=None if there.all() else torch.from_numpy(there))
                 for name, array in values.items():
                     array[rows] = getattr(result, name).numpy()
@@ -159,7 +160,7 @@ class _Cells:
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
     """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
 
-    Problems with at least 16 pairs are padded to 16, 20, 24, 28, 32, 40, 48, ... pairs, by at most a quarter.
+    Problems with at least 16 pairs are padded, by at most a quarter, to the next of 16, 20, 24, 28, 32, 40, 48, ...
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

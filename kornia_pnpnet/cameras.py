@@ -1,7 +1,7 @@
 """Undistort pixels, convert pixels to bearings, make cameras that look along bearings, and project points.
 
 The *undistorted point* of a pixel lies on the pixel's ray and on the plane z = 1. Rays of a fisheye can miss the plane.
-For a fisheye, the point is the unit vector of the ray's (x, y) times the angle between the ray and the optical axis.
+For a fisheye, the point is instead the unit vector along the ray's (x, y), times the ray's angle to the optical axis.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ def undistort(
         The undistorted pixels; whether each pixel could be undistorted, bool :math:`(B, N)`; and the noise of the
         undistorted pixels. A pixel cannot be undistorted if it is outside the range of the polynomial, if it is more
         than 85 degrees off the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point
-        replaces such a pixel. Sigmas are multiplied by the root mean square of the Jacobian's singular values.
+        replaces such a pixel. Each sigma is multiplied by the root mean square of the singular values of the
+        undistortion's Jacobian.
     """
     check_form(["B", "N", "2"], img_points=img_points)
     camera, _ = pinholes(intrinsics)
@@ -79,7 +80,7 @@ def undistort(
         point = torch.where(found[..., None], point, 0.0)
     pixels = transform_points(camera, flatten(point))
     if noise is not None:
-        with torch.no_grad():  # derivative of the undistorted point by the distorted point
+        with torch.no_grad():  # derivative of the undistorted point with respect to the distorted point
             jacobian = _linearised(flatten, point)[1] @ _inverse(_linearised(lens, point)[1])
             eye = torch.eye(2, dtype=jacobian.dtype, device=jacobian.device)
             jacobian = torch.where(found[..., None, None], jacobian, eye)
@@ -120,7 +121,7 @@ def bearings(
     Bearings of a fisheye may be more than 90 degrees off the optical axis.
 
     Args:
-        img_points: shape :math:`(B, N, 2)`; :math:`B` stands for any number of leading dimensions, also for none.
+        img_points: shape :math:`(B, N, 2)`. :math:`B` stands for any number of leading dimensions, including none.
         intrinsics: shape :math:`(B, 3, 3)` or :math:`(3, 3)`.
         dist: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         fisheye: see ``PnPNet.forward``.
@@ -186,8 +187,8 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_form(["*", "3"], rays=rays)
     rays = rays.to(common_dtype({"rays": rays}))
-    largest = rays.detach().abs().amax(-1, keepdim=True)  # in this unit, squares cannot overflow
-    # The gradient of a direction with smaller entries than this limit would overflow.
+    largest = rays.detach().abs().amax(-1, keepdim=True)  # after division by this number, squares are finite
+    # The gradient of a direction would overflow if all its entries were below this limit.
     sound = (largest > torch.finfo(rays.dtype).tiny ** 0.5) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
     rays = normalize(torch.where(sound, rays, axis) / torch.where(sound, largest, 1.0), dim=-1)
@@ -280,7 +281,7 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target``, and tell which targets have one. The others get 0."""
+    """Find points (B, N, 2) that a lens maps to ``target``, and tell which targets have such a point. Others get 0."""
     # The longest Newton step is half the distance of the target from the centre. The two steps after the loop carry
     # gradients to the target and the coefficients. The second of them makes second derivatives exact.
     with torch.no_grad():

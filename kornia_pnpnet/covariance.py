@@ -21,13 +21,13 @@ from kornia_pnpnet.result import Pose, PosePrior, sound_pose
 
 __all__ = ["pose_covariance", "shown_noise"]
 
-# Least eigenvalue of a regular information matrix with a unit diagonal. Smaller eigenvalues are rounding errors of
-# float64.
+# An information matrix with a unit diagonal is regular if its least eigenvalue exceeds this number. Smaller eigenvalues
+# are rounding errors of float64.
 _LEAST_EIGENVALUE = 1e-13
-# Largest factor between the given focal length and the focal length that fits the pixels at the pose. A larger factor
-# shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
+# The given focal length may differ from the focal length that fits the pixels at the pose by this factor. A larger
+# difference shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
 _FOCAL_RATIO = 1.5
-# `shown_noise` tries these shares of pixel noise in the mean variance of a pixel. Noise of points causes the rest.
+# `shown_noise` tries these shares of pixel noise in the mean variance of a pixel. Noise of points is the other share.
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
@@ -56,7 +56,7 @@ def pose_covariance(
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
     least squares on the inliers (P. Huber, "Robust Statistics", 1981). The weights are therefore divided by their mean
-    over the inliers, :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and bounded: :math:`w_i = \min(1, u_i / \bar u)`.
+    over the inliers, :math:`\bar u = \sum_i u_i^2 / \sum_i u_i`, and limited to 1: :math:`w_i = \min(1, u_i / \bar u)`.
 
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -75,11 +75,11 @@ def pose_covariance(
         focal_sigma: the solver's ``focal_sigma``. Its information is added to the information of the pairs.
 
     Returns:
-        Shape :math:`(B, 6, 6)` in radians and the unit of the world. The dtype is the dtype of a solver's result. With
-        an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the logarithm of
-        the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the diagonal is
-        infinite and all other entries are 0. The same holds if ``focal`` is ``"unknown"`` and the given focal length
-        differs by more than a factor of 1.5 from the focal length that the pixels show at the pose.
+        The covariance in radians and the unit of the world, shape :math:`(B, 6, 6)`, with the dtype of a solver's
+        result. With an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the
+        logarithm of the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the
+        diagonal is infinite and all other entries are 0. The same holds if ``focal`` is ``"unknown"`` and the given
+        focal length differs by more than a factor of 1.5 from the focal length that the pixels show at the pose.
 
     Raises:
         BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` has another value,
@@ -164,7 +164,7 @@ def shown_noise(
     """Estimate the noise of pixels and points from the residuals at a pose.
 
     The noise of a point moves its pixel less if the depth is larger. The noise of a pixel does not depend on the depth.
-    Of five mixtures of noise of pixels and points, the mixture with the largest Gaussian likelihood is chosen.
+    Five mixtures of pixel noise and point noise are compared. The mixture with the largest Gaussian likelihood is used.
 
     For arguments see :func:`pose_covariance`. Returns a dict of ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
     """

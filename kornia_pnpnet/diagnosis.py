@@ -20,12 +20,13 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["Diagnosis", "Trial", "diagnose"]
 
-# Trials are equally good if their evidence per pair differs by less than this number (as 1 px and 1.28 px of noise).
+# Trials are equally good if their evidence per pair differs by less than this number. Noise of 1.28 px in place of 1 px
+# causes this difference.
 _EQUAL = 0.5
 
 
 class Trial(NamedTuple):
-    """Agreement of the pairs with the best pose after one change of the input. Numbers are medians of the batch."""
+    """Agreement of the pairs with the best pose after one change of the input. Numbers are medians over the batch."""
 
     change: str  #: The change in words.
     evidence: float  #: Evidence for the pose, see :mod:`kornia_pnpnet.judge.evidence`, divided by the number of pairs.
@@ -38,7 +39,7 @@ class Diagnosis(NamedTuple):
     """The result of :func:`diagnose`. Its ``str`` is one sentence."""
 
     trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
-    #: The trials that are ``ok`` and equally good. The input as given, or with another pose, excludes other trials.
+    #: The trials that are ``ok`` and equally good. A trial that leaves the pairs unchanged excludes all other trials.
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:
@@ -64,7 +65,7 @@ def diagnose(
     The mistakes are swapped pixel coordinates, a y axis that points up, a left-handed world, an incorrect principal
     point or focal length, the intrinsics of a resized image, normalised coordinates in place of pixels, and a
     camera-to-world pose. The solver ``pnpnet-set`` solves the input after each change, and the evidence for the poses
-    is compared. Points of a plane cannot show a mirrored world, swapped coordinates or a flipped axis.
+    is compared. Points in one plane cannot reveal a mirrored world, swapped coordinates or a flipped axis.
 
     Args:
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. All problems of a batch must

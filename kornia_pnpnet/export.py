@@ -113,7 +113,7 @@ def export_program(
 
     Returns:
         A program that maps :data:`INPUTS`, with the shapes of ``PnPNet.forward``, to the fields of
-        :class:`ExportedResult`, or of :class:`ExportedCamera` if the focal length is unknown. Padding has the weight 0.
+        :class:`ExportedResult`, or of :class:`ExportedCamera` if the focal length is unknown. Padding needs weight 0.
         A program for rigs takes :data:`RIG_INPUTS`, with a camera matrix for each pair, :math:`(B, N, 3, 3)`.
 
     Raises:
@@ -195,16 +195,16 @@ def export_package(
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
     :func:`load_package` loads the package without tracing or compiling. C++ programs need only libtorch to load it. A
-    package runs on one thread. It needs the PyTorch version of the compiling program, and a CPU with the instruction
-    sets (for example AVX-512) of the compiling CPU. Compiling takes minutes. An existing file is replaced when the
-    package is complete.
+    package runs on one thread. It needs the same PyTorch version as the program that compiled it, and a CPU with the
+    instruction sets (for example AVX-512) of the CPU that compiled it. Compiling takes minutes. An existing file is
+    replaced only when the package is complete.
 
     A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
     packages. With PyTorch's own loader, a call of such a package overwrites the previous result of the same thread.
 
     ``n`` may also be several numbers of pairs, such as ``(16, 64, 256)``. The file then holds a model for each number,
-    and a problem is padded to the next number. C++ programs choose a model by its name: "n16" is the model for 16
-    pairs. The name of a single model is "model".
+    and a problem is padded to the next of these numbers. C++ programs choose a model by its name: "n16" is the model
+    for 16 pairs. The name of a single model is "model".
 
     Returns:
         The path, which must end in ``.pt2``.
@@ -250,8 +250,8 @@ class PackagedSolver:
 
     Attributes:
         batch: number of problems in each call; ``None``: any number.
-        sizes: the numbers of pairs of the package's models, in increasing order; empty: any number of at least 4. With
-            several models, the smallest model that is large enough solves a problem, and the problem is padded.
+        sizes: the numbers of pairs for which the package has models, in increasing order; empty: any number of at least
+            4. With several models, each problem is padded and solved by the smallest model that is large enough.
         rig: whether the package solves problems of rigs.
     """
 
@@ -328,7 +328,7 @@ def export_onnx(
     """Write a solver to one file as an ONNX model, for ONNX Runtime without PyTorch, and return the path.
 
     See :func:`export_program` for the arguments, inputs, outputs and errors. Without the extra ``onnx``, the function
-    raises ``ImportError``. An existing file is replaced when the model is complete.
+    raises ``ImportError``. An existing file is replaced only when the model is complete.
     """
     check_packages(".onnx")
     path = Path(path)

@@ -41,7 +41,7 @@ class Frame(NamedTuple):
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
         img_scale: number of pixels of the problem per pixel of the caller, shape :math:`(B,)`. The number is the
-            geometric mean of the absolute factors of u and v, and in a rig also the mean over the pairs.
+            geometric mean of the absolute scales of u and v, in a rig averaged over the pairs.
         order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
@@ -105,9 +105,9 @@ class Normalize(Configured):
     Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0.
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
-    with or without skew). At least three of its pairs have a positive weight, and its points do not coincide or lie on
-    one line, not even within the rounding of coordinates. The inputs of invalid problems are replaced by zeros, so that
-    all later values and gradients are finite. A pair of weight 0 is padding. The coordinates of padding are ignored.
+    with or without skew). At least three of its pairs have a positive weight. Its points span more than a line, by more
+    than the rounding of coordinates. The inputs of invalid problems are replaced by zeros, so that all later values and
+    gradients are finite. A pair of weight 0 is padding. The coordinates of padding are ignored.
 
     Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
     the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
@@ -218,7 +218,7 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, typical.new_full((), _FAR_OF_FEW), _FAR) * typical
         seen = there & (off_axis <= self.f_const * _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # few are seen: keep wide angles
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # if few are seen, keep wide angles
         is_usual = usual.to(rows.dtype)
 
         # Compute centre and scale from the usual points. Squares are in units of the largest coordinate.
@@ -243,7 +243,7 @@ class Normalize(Configured):
             rig = sound_pose(rig, sound)
         status = torch.where(spread_out, Status.PRECISION.value, Status.DEGENERATE.value)
         status = status.masked_fill(is_precise, Status.SOLVED.value)
-        status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # invalid, or does not fit the pixels
+        status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # camera invalid or not fitting the pixels
         if padded:
             status = status.masked_fill(given.sum(0) < MIN_PAIRS, Status.TOO_FEW_PAIRS.value)
         ignored = None

@@ -34,7 +34,7 @@ _PRIOR_TRANSLATION = 0.5
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth, as a share of the distance of the points. A smaller depth is raised, and the residual gets a penalty.
+# Least depth, as a share of the distance to the points. Smaller depths are raised to it, and the residual is penalised.
 _LEAST_DEPTH = 0.02
 
 
@@ -62,18 +62,19 @@ def monte_carlo_pose_loss(
     The likelihood compares the true pose with all other poses. The loss has useful gradients from the first step of a
     training, when no pose fits the correspondences. The density of a pose :math:`y` is
     :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted sum of the robust losses of the
-    residuals in standard deviations. If the world points have noise, the cost includes the logarithm of the variance.
-    In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the true translation
-    with half the distance between camera and points as its scale. Importance sampling estimates the constant :math:`Z`.
+    residuals, which are in standard deviations. If the world points have noise, the cost includes the logarithm of the
+    variance. In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the true
+    translation. The scale of this distribution is half the distance between camera and points. Importance sampling
+    estimates the constant :math:`Z`.
 
-    The same number of samples is drawn from each component of a mixture. The components are the prior and t
-    distributions around the true pose, around each hypothesis, and around ``rounds`` modes. A mode is the refined
-    sample with the largest importance weight so far. The precision of a t distribution is the matrix of the normal
-    equations at its centre. Gradients flow to all inputs except poses. A problem that a solver would refuse has the
-    loss 0 without gradient.
+    The same number of samples is drawn from each component of a mixture. The components are the prior and several t
+    distributions: one around the true pose, one around each hypothesis, and one around each of ``rounds`` modes. A mode
+    is found by refining the sample with the largest importance weight so far. The precision of a t distribution is the
+    matrix of the normal equations at its centre. Gradients flow to all inputs except poses. A problem that a solver
+    would refuse has the loss 0 without gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
-    4 to 7; here with hypotheses and a prior, and with modes in place of fitted proposals.
+    4 to 7. This function adds hypotheses and a prior, and uses modes in place of fitted proposals.
 
     Args:
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
@@ -90,7 +91,7 @@ def monte_carlo_pose_loss(
         samples: number of poses drawn per problem, rounded down to a multiple of the number of components.
         rounds: number of t distributions around modes.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
-        scale: scale of the kernel in standard deviations. For ``"power"``, the exponent.
+        scale: scale of the kernel in standard deviations, or the exponent of the kernel ``"power"``.
 
     Returns:
         The loss of each problem in nats, shape :math:`(B,)`. The density is per radian³ and world unit³.

@@ -28,7 +28,7 @@ __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
 # Least probability in the cross entropy, so that the loss of a single pair is bounded.
 _LEAST_PROBABILITY = 1e-3
-# Squared residuals in variances are clipped to this value, because larger residuals are not noise.
+# Squared residuals, as multiples of the variance, are clipped to this value, because larger residuals are not noise.
 _MOST_VARIANCES = 20.0
 
 
@@ -37,7 +37,7 @@ class LossTerms(NamedTuple):
 
     total: Tensor  #: Weighted sum of the terms. The refined distances are saturated, see :class:`PoseLoss`.
     init_rotation: Tensor  #: Chordal rotation distance of the first guess.
-    init_translation: Tensor  #: Distance of the first guess's translation, at the centroid of the points.
+    init_translation: Tensor  #: Translation distance of the first guess, compared at the centroid of the points.
     refined_rotation: Tensor  #: Chordal rotation distance after refinement.
     refined_translation: Tensor  #: Translation distance after refinement.
     weights: Tensor  #: Cross entropy of the weights, which are inlier probabilities; 0 in :class:`PoseLoss`.
@@ -90,9 +90,9 @@ class PoseLoss(nn.Module):
     r"""Weighted sum of the rotation and translation distances of the first guess and of the refined pose.
 
     Refined translations are compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`.
-    Translations of the first guess are compared at the centroid of the points, because an error at a distant origin
-    repeats the rotation error. The error of a failed refinement has no bound. The weighted refined distance :math:`d`
-    of a problem is therefore saturated to :math:`d / (1 + d / c)`.
+    Translations of the first guess are compared at the centroid of the points. At a distant origin, the translation
+    error would repeat the rotation error. The error of a failed refinement has no bound. The weighted refined
+    distance :math:`d` of a problem is therefore saturated to :math:`d / (1 + d / c)`.
 
     Args:
         rotation: weight of the chordal rotation distances.
@@ -152,7 +152,8 @@ class SetLoss(nn.Module):
 
     - First guess: a weighted mean of the best hypothesis's distance and the mean distance of all hypotheses. The best
       hypothesis has most of the weight, so that hypotheses can differ.
-    - Refined pose: the sum of both distances, each divided by its limit of success, saturated as in :class:`PoseLoss`.
+    - Refined pose: the sum of the rotation and translation distances, each divided by its limit of success. The sum is
+      saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
     - Negative log-likelihood of the estimated noise, given the inliers' residuals at the true pose.
 

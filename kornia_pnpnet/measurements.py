@@ -34,10 +34,10 @@ _CELL_VARIANCE = 1.0 / 12.0
 def heatmap_keypoints(
     heatmaps: Tensor, temperature: Tensor | float = 1.0, *, stride: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    r"""Compute keypoints and their covariances, the mean and the covariance of the softmax of each heat map.
+    r"""Compute a keypoint and its covariance for each heat map: the mean and the covariance of the map's softmax.
 
     The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance is
-    the covariance of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), and thus
+    the covariance of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction). It is thus
     positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
 
     Convention:
@@ -111,7 +111,7 @@ def depth_points(
     A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
     :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
     exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the
-    derivative of :math:`r` with respect to the pixel, and :math:`\Sigma` the covariance of the pixel.
+    derivative of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel.
 
     Args:
         img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`, with any leading dimensions.
@@ -125,9 +125,9 @@ def depth_points(
 
     Returns:
         A solver's ``world_points``, shape :math:`(B, N, 3)`, and its ``world_cov`` in squared units of the world, shape
-        :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its sigma is negative, a
-        number is not finite or so large that its fourth power overflows, or its camera or pose is invalid. Exclude
-        such a pair by the solver's ``mask``, else its problem is not ``ok``.
+        :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its sigma is negative, or
+        its camera or pose is invalid. The same holds if one of its numbers is not finite, or is so large that its
+        fourth power overflows. Exclude such a pair with the solver's ``mask``; otherwise its problem is not ``ok``.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma

@@ -138,7 +138,7 @@ def success_rate(successes: Tensor) -> SuccessRate:
     r"""Success rate with its 95 % Wilson score interval (E. B. Wilson, 1927).
 
     Args:
-        successes: bool, any shape with at least one element; else ``ValueError``.
+        successes: bool, any shape with at least one element. Other tensors raise ``ValueError``.
 
     Example:
         >>> print(success_rate(torch.tensor([True] * 8 + [False] * 2)))

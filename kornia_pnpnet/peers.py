@@ -45,8 +45,8 @@ class PeerSolver(nn.Module):
     r"""A batched layer around a solver of another library. The library solves one problem at a time.
 
     A subclass is a dataclass that implements :meth:`solve_one`. The fields are the arguments of the constructor. The
-    library gets the pairs that are present and have a weight above 0, but not the weights. A problem without a pose has
-    ``ok=False``, and its pose is the identity. A problem is not solved if it has fewer than three pairs, a negative
+    library gets the pairs that are not padding and have a weight above 0, but not the weights. If no pose is found,
+    ``ok`` is false, and the pose is the identity. A problem is not solved if it has fewer than three pairs, a negative
     weight, a value that is not finite, or a camera with skew or a focal length of 0.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
@@ -241,9 +241,10 @@ class OpenCVRansac(_OpenCV, RobustPeer):
     Args:
         threshold: largest reprojection error of an inlier in pixels.
         iterations: largest number of RANSAC iterations.
-        confidence: RANSAC stops when a sample without outliers was drawn with this probability, in (0, 1).
+        confidence: RANSAC stops when a sample without outliers was drawn with at least this probability, in (0, 1).
         method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
-        refine: refine the pose of RANSAC, ``PnPResult.init``, by least squares of the inliers' reprojection errors.
+        refine: whether to refine RANSAC's pose by least squares of the inliers' reprojection errors. The field ``init``
+            of the result is the pose before this refinement.
         seed: seed of OpenCV's global random numbers, set before each problem.
 
     Example:
@@ -294,8 +295,9 @@ class OpenCVUsac(OpenCVRansac):
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
 
-    kornia-rs computes in float32. Its local optimisation is off, because it does not solve more of the
-    ``SyntheticProblems``. For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
+    kornia-rs computes in float32. Its local optimisation is off, because this option does not increase the number of
+    solved ``SyntheticProblems``. For ``threshold`` and its tuning, ``confidence`` and ``seed``, see
+    :class:`OpenCVRansac`.
 
     Args:
         max_iterations: largest number of RANSAC iterations.
@@ -327,7 +329,7 @@ class KorniaRs(RobustPeer):
 class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
-    For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
+    For ``threshold`` and its tuning, ``confidence`` and ``seed``, see :class:`OpenCVRansac`.
 
     Args:
         min_iterations: smallest number of RANSAC iterations. PoseLib's default, 1000, is not better for 9 pairs.
@@ -365,10 +367,10 @@ class PoseLib(RobustPeer):
 class PyColmap(RobustPeer):
     r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
 
-    For ``threshold``, its tuning, ``confidence`` and ``seed`` see :class:`OpenCVRansac`.
+    For ``threshold`` and its tuning, ``confidence`` and ``seed``, see :class:`OpenCVRansac`.
 
     Args:
-        loss_scale: scale of the Cauchy loss of the refinement in pixels, tuned like ``threshold``. COLMAP's own default
+        loss_scale: scale in pixels of the refinement's Cauchy loss, tuned like ``threshold``. COLMAP's own default
             of 1 px suits world points with little noise, but solves several per cent fewer ``SyntheticProblems``.
         min_iterations: smallest number of RANSAC iterations.
         max_iterations: largest number of RANSAC iterations.

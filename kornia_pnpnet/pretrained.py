@@ -1,4 +1,4 @@
-"""Saving and loading of weights as safetensors: shipped weights, local folders, and repositories of the Hub."""
+"""Save weights as safetensors, and load weights from the package, a local folder, or the Hugging Face Hub."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class PretrainedMixin(nn.Module):
         """Load a trained solver in evaluation mode. Its parameters require gradients.
 
         The solver can be trained further after ``solver.train()``. For inference alone, use ``torch.no_grad()`` or
-        ``solver.requires_grad_(False)``, or :func:`~kornia_pnpnet.create_solver` for shipped solvers.
+        ``solver.requires_grad_(False)``, or load a shipped solver with :func:`~kornia_pnpnet.create_solver`.
 
         Args:
             name_or_folder: see :func:`~kornia_pnpnet.pretrained.find_weights`. No code in the files is run.

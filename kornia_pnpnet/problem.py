@@ -18,7 +18,7 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Inputs", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
 
-#: Least standard deviation of a pixel in focal lengths, so that the weights of exact pixels are finite.
+#: Least standard deviation of a pixel, in focal lengths. It keeps the weights of exact pixels finite.
 LEAST_NOISE = 1e-6
 #: Least number of pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
@@ -57,7 +57,7 @@ class Noise(NamedTuple):
 
     Attributes:
         img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``,
-            the sigma of isotropic noise with the same trace, because networks ignore ``img_cov``.
+            this is the sigma of isotropic noise with the same trace, because networks ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, each entry of shape :math:`(B, N)`. ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.
@@ -151,7 +151,7 @@ class Problem(NamedTuple):
         weights: weight of each pair, at least 0; 0 for padding, shape :math:`(B, N)`.
         focal: the focal length in pixels, a scalar for all problems. An unknown focal length has this initial value.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
-        world_scale: lengths of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
+        world_scale: units of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
         usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), else 0, shape :math:`(B, N)`.
         noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown.
         confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`.
@@ -196,7 +196,7 @@ class Problem(NamedTuple):
 
     @property
     def usual_weights(self) -> Tensor:
-        """Weights for initialisers that are not robust, 0 for pairs that are not usual, shape :math:`(B, N)`."""
+        """Weights for non-robust initialisers, 0 for unusual pairs, shape :math:`(B, N)`."""
         return self.weights * self.usual
 
     @property
@@ -234,7 +234,7 @@ class Starts(NamedTuple):
 
     Attributes:
         pose: a coarse pose in the frame of the :class:`Problem`.
-        weights: a factor for the weight of each pair, at least 0, shape :math:`(B, N)`.
+        weights: number of at least 0 by which the weight of each pair is multiplied, shape :math:`(B, N)`.
         ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: all true.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
         noise: noise of each pair in the units of the problem, without covariances. The initialiser estimates what the

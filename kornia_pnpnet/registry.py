@@ -35,7 +35,7 @@ _PAPERS_SAMPLE = 7
 
 
 def _trained(weights: str, m: int | None = None) -> PnPNet:
-    """A trained solver with ``m`` iterations. With 0, the network is used alone (the paper's "Net")."""
+    """A trained solver with ``m`` iterations. With ``m=0``, the network is used alone (the paper's "Net")."""
     solver = PnPNet.from_pretrained(weights)
     return solver if m is None else solver.with_options(refine=solver.refine.with_iterations(m))
 
@@ -104,11 +104,11 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Args:
         name: one of :func:`list_solvers`.
-        options: arguments of the solver's class: :class:`~kornia_pnpnet.propose.epnp.EPnP`,
-            :class:`~kornia_pnpnet.propose.reppnp.REPPnP`, :class:`~kornia_pnpnet.propose.ransac.RANSAC` or one of
-            :mod:`kornia_pnpnet.peers`. Trained solvers and names with ``-lm`` take ``m``, the number of iterations (see
-            :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers of this package also take the
-            options of :class:`~kornia_pnpnet.solver.PnPNet`.
+        options: arguments of the solver's class, which is :class:`~kornia_pnpnet.propose.epnp.EPnP`,
+            :class:`~kornia_pnpnet.propose.reppnp.REPPnP`, :class:`~kornia_pnpnet.propose.ransac.RANSAC` or a class of
+            :mod:`kornia_pnpnet.peers`. Trained solvers and solvers with ``-lm`` in their name take ``m``, the number of
+            iterations (see :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.with_iterations`). Solvers of this package
+            also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
         The solver as a module in evaluation mode. Its parameters do not require gradients, so that a result has a

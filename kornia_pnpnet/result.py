@@ -92,7 +92,7 @@ class Pose(NamedTuple):
         r"""A pose from a quaternion :math:`(w, x, y, z)`, the order of COLMAP and Kornia.
 
         Args:
-            quaternion: any length but 0, shape :math:`(B, 4)`.
+            quaternion: of any length except 0, shape :math:`(B, 4)`.
             translation: shape :math:`(B, 3)`.
         """
         return cls._of_vectors(quaternion_to_rotation_matrix, "quaternion", quaternion, 4, translation)
@@ -218,7 +218,7 @@ class PosePrior(NamedTuple):
 
     Attributes:
         pose: the expected world-to-camera pose.
-        information: inverse of the covariance in radians and the unit of the world, positive semi-definite, shape
+        information: inverse of the covariance (in radians and the unit of the world), positive semi-definite, shape
             :math:`(B, 6, 6)`. An unknown component of :math:`(\omega, v)` has zeros in its row and column.
         scale: scale :math:`c` of Welsch's kernel, shape :math:`(B,)`; ``None``: 3. The weight of the prior is
             :math:`\exp(-2 s / (k c^2))`, where :math:`k` is the rank of ``information``, and :math:`s` the squared
@@ -302,8 +302,8 @@ class PnPResult(NamedTuple):
         weights: final weight of each pair, in the caller's order, shape :math:`(B, N)`.
         cost: robust loss of the pairs and of a prior, divided by the number of pairs, in the unit of the kernel (see
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
-        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the fields above,
-            ``intrinsics`` and ``dist`` are finite. These fields then have a gradient only with ``gradient="always"``.
+        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, ``intrinsics``, ``dist``
+            and all fields above are finite. These fields then have a gradient only with ``gradient="always"``.
         init: the first guess. The first guess of every valid problem has a gradient, even if the refinement failed, so
             that an initialiser can learn from failures.
         status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
@@ -312,8 +312,8 @@ class PnPResult(NamedTuple):
             libraries return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; empty unless the call requested alternatives.
         intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`. In a rig the shape may be
-            :math:`(B, N, 3, 3)`. The estimate replaces an unknown focal length. For one camera, the identity replaces
-            an invalid matrix.
+            :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. For one camera, the identity
+            replaces an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
         sigma: standard deviation of a pixel coordinate, estimated from the inliers, in the caller's pixels, shape
             :math:`(B,)`, without gradient. The estimate includes the noise of the points,
@@ -336,7 +336,7 @@ class PnPResult(NamedTuple):
     inliers: Tensor = _UNSET
 
     def __repr__(self) -> str:
-        """Five lines: the number of ``ok`` problems, median and range of inliers, sigma and probability, the pose."""
+        """Five lines: number of ``ok`` problems; median and range of inliers, of sigma, of probability; the pose."""
         shown = self.ok, self.status, self.inliers, self.sigma, self.probability, *self.pose
         if not all(type(x) is Tensor and sees_values(x) and x.numel() for x in shown):
             return tuple.__repr__(self)
@@ -381,8 +381,8 @@ class PnPResult(NamedTuple):
             img_points: the pixels of the solver's call.
             intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the ``intrinsics`` of the
                 result replace them.
-            noise: further arguments of ``pose_covariance``. The default weights are ``inliers``. Without noise, the
-                noise is estimated from the residuals of the inliers (see
+            noise: further arguments of ``pose_covariance``. The default weights are ``inliers``. If no noise is given,
+                the noise is estimated from the residuals of the inliers (see
                 :func:`~kornia_pnpnet.covariance.shown_noise`). If only noise of the points is given, ``sigma`` is the
                 noise of the pixels.
 

@@ -40,8 +40,9 @@ __all__ = ["PnPNet"]
 
 # Largest norm of the gradient of a problem's loss with respect to normalised inputs. Usual norms are about 1.
 _LONGEST_GRADIENT = 10.0
-# Number of additional iterations from a nominal focal length (see `_with_camera`) or with radial distortion. With 1000
-# pairs, fewer do not converge (CameraProblems, seeds 4321, 4322). Only these iterations give distortion a gradient.
+# Number of additional iterations if the focal length starts from a nominal value (see `_with_camera`) or distortion is
+# estimated. With 1000 pairs, fewer iterations do not converge (CameraProblems, seeds 4321, 4322). Only these iterations
+# give the distortion a gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -67,13 +68,13 @@ class PnPNet(PretrainedMixin):
     r"""Find the pose of a calibrated camera from 2D-3D correspondences with outliers.
 
     The layer normalises the correspondences, lets ``init`` propose poses, refines and judges the poses, and expresses
-    the best pose in the frame of the inputs. All steps are batched and differentiable. An unsolvable problem gets
-    ``ok=False``, a ``status`` with the reason (see :class:`~kornia_pnpnet.result.Status`), and a finite pose without
-    gradient, and does not affect other problems.
+    the best pose in the frame of the inputs. All steps are batched and differentiable. An unsolvable problem does not
+    affect other problems. Its result has ``ok=False``, a ``status`` with the reason (see
+    :class:`~kornia_pnpnet.result.Status`), and a finite pose without gradient.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``. All
-    multiples of a camera matrix are the same camera. Focal lengths may be negative, for example ``fy`` in an image with
-    v up.
+    multiples of a camera matrix are the same camera. Focal lengths may be negative, for example ``fy`` if the v axis of
+    the image points up.
 
     Precision: the layer computes in float64 if any input tensor is float64, else in float32. Results have the dtype of
     the computation. Integer inputs are converted. Inputs in float16 or bfloat16 are also converted, because half
@@ -82,33 +83,33 @@ class PnPNet(PretrainedMixin):
 
     Args:
         init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to
-            :class:`~kornia_pnpnet.problem.Starts`. ``None``: the refinement starts from ``init`` or ``prior`` of the
-            call, else from the identity.
+            :class:`~kornia_pnpnet.problem.Starts`. ``None``: the refinement starts from the call's ``init`` or
+            ``prior``, or from the identity if the call has neither.
         refine: the refiner. ``None``: a classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM`.
         normalize: the normalisation; the default centres and scales the world and sorts the pairs.
-        effort: ``"adaptive"``: a problem whose first poses do not suffice gets further minimal samples (see
-            :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
+        effort: ``"adaptive"``: a problem gets further minimal samples if the poses of the initialiser explain too few
+            pairs (see :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
             :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
-            adaptive in evaluation mode if the initialiser estimates the noise and the refinement has iterations.
-            Unless the effort is ``"fixed"``, a pose of one camera is compared with other poses in evaluation mode (see
-            :func:`~kornia_pnpnet.propose.alternatives.reconsider`), and RANSAC for rigs and bearings chooses the number
-            of its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in
-            ``torch.func.vmap`` and on the device ``meta``.
-        gradient: which problems have a gradient. ``"ok"``: problems whose result is ``ok``, with a ``RuntimeWarning``
-            if no problem of the first batches is ``ok``. ``"always"``: all valid problems; the gradient of each
+            the effort is adaptive in evaluation mode if the initialiser estimates the noise and the refinement has
+            iterations. Two more steps depend on the data unless the effort is ``"fixed"``. In evaluation mode, a pose
+            of one camera is compared with other poses (see :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
+            For rigs and bearings, RANSAC chooses the number of its samples. The effort is always fixed in exported
+            graphs, with ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``.
+        gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If the first batches
+            have no such problem, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems. The gradient of each
             problem's loss with respect to its normalised inputs then has a norm of at most 10. To train a network from
             random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
-        views: number of views of each problem, 1 to 8: the problem itself and its mirror images, for which a network
-            proposes different poses (see :mod:`kornia_pnpnet.propose.views`).
+        views: number of views of each problem, 1 to 8. The views are the problem itself and its rotated or mirrored
+            copies. A network proposes a different pose for each view (see :mod:`kornia_pnpnet.propose.views`).
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
-            The intrinsics of the call then give the principal point, the aspect ratio, and the skew relative to the
-            focal length. With ``SetInit`` the refinement starts from the middle of the range of focal lengths. If the
-            result is not believed, or with another initialiser, a given pose or ``radial``, a search with P3P finds an
-            initial focal length. A problem is not ``ok`` when the standard deviation of log f exceeds 0.15.
+            The intrinsics of the call then give the principal point, the aspect ratio, and the ratio of the skew to the
+            focal length. With ``SetInit`` the refinement starts from the middle of the range of focal lengths. A search
+            with P3P finds the initial focal length if this result is not believed, if another initialiser is used, or
+            if a pose or ``radial`` is given. A problem is not ``ok`` when the standard deviation of log f exceeds 0.15.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
-        radial: number of coefficients of radial distortion that are estimated with an unknown focal length, 0 to 2. The
-            result's ``dist`` has the estimates.
+        radial: number of coefficients of radial distortion, 0 to 2, that are estimated together with an unknown focal
+            length. The result's ``dist`` has the estimates.
 
     Raises:
         BaseError: when an option has an invalid value, when ``effort="adaptive"`` is given without an initialiser that
@@ -183,42 +184,43 @@ class PnPNet(PretrainedMixin):
         Args:
             world_points: shape :math:`(B, N, 3)`, any unit, floats or integers. In all arguments and in the result,
                 :math:`B` stands for any number of leading dimensions. A single problem needs no leading dimension.
-            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, shape :math:`(B, N, 3)`. Bearings are directions
-                of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
-            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`, or Kornia's cameras (extrinsics are
-                ignored). In a rig, each pair may have a matrix, shape :math:`(B, N, 3, 3)`. With bearings, ``None``
-                is allowed. If intrinsics are given, sigmas and thresholds of bearings are in pixels at the given focal
-                length; otherwise, they are in radians.
-            weights: weight of each pair, the same for u and v, at least 0, shape :math:`(B, N)`; 1 when ``None``.
+            img_points: pixels, shape :math:`(B, N, 2)`; or bearings, shape :math:`(B, N, 3)`. Bearings are direction
+                vectors of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
+            intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`; or Kornia's cameras, whose
+                extrinsics are ignored. In a rig, each pair may have its own matrix, shape :math:`(B, N, 3, 3)`. With
+                bearings, ``None`` is allowed, and sigmas and thresholds are then in radians. If intrinsics are given
+                with bearings, sigmas and thresholds are in pixels at the given focal length.
+            weights: weight of each pair for u and v, at least 0, shape :math:`(B, N)`. ``None``: all weights are 1.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
-                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. The nearest
-                rotation replaces a matrix that is no exact rotation, also in ``prior`` and ``cam_from_rig``. A pose is
-                ignored if it is not finite, or if the determinant of its matrix is not positive.
-            img_sigma: standard deviation of the noise on each pixel coordinate, a number, :math:`(B,)` or
-                :math:`(B, N)`, at least 0; NaN where unknown. With ``img_sigma`` or ``world_sigma``, residuals and the
-                scales of the refinement's kernel are in standard deviations.
-            world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``;
-                shapes and NaN as for ``img_sigma``.
-            img_cov: covariance of the noise of each pixel in px², in place of ``img_sigma``, shape
-                :math:`(B, N, 2, 2)`, symmetric and positive semi-definite.
-            world_cov: covariance of the noise of each world point, in place of ``world_sigma``, shape
-                :math:`(B, N, 3, 3)`.
+                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. A matrix that is
+                not exactly a rotation is replaced by the nearest rotation. This also holds for ``prior`` and
+                ``cam_from_rig``. ``init`` is ignored if it is not finite, or if the determinant of its matrix is not
+                positive.
+            img_sigma: standard deviation of the noise on each pixel coordinate, at least 0: a number, or a tensor of
+                shape :math:`(B,)` or :math:`(B, N)` with NaN where unknown. With ``img_sigma`` or ``world_sigma``,
+                residuals and the scales of the refinement's kernel are in standard deviations.
+            world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``. The
+                shapes and the meaning of NaN are those of ``img_sigma``.
+            img_cov: covariance of the noise of each pixel in px², symmetric and positive semi-definite, shape
+                :math:`(B, N, 2, 2)`. Give ``img_cov`` or ``img_sigma``, not both.
+            world_cov: covariance of the noise of each world point, shape :math:`(B, N, 3, 3)`. Give ``world_cov`` or
+                ``world_sigma``, not both.
             confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. Values up to 0.001 below 0 or above 1 are rounded to 0 or 1. A pair
-                with a value outside this range is left out. Pairs of high confidence are drawn more often for minimal
-                samples. Confidences are an input of networks that were trained with confidences. Confidences need not
-                be calibrated.
-            prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior is a term
-                of the refinement and of the choice of the best pose. Unless ``init`` is given, the refinement also
-                starts from the prior's pose. ``ok`` and ``probability`` depend on the pairs alone. If the noise is
-                unknown, the refinement with a prior assumes a standard deviation of one pixel.
+                with any other value outside [0, 1] is left out. Pairs of high confidence are drawn more often for
+                minimal samples. Networks that were trained with confidences take confidences as an input. Confidences
+                need not be calibrated.
+            prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior adds a
+                term to the cost, and thus affects the refinement and the choice of the best pose. Unless ``init`` is
+                given, the refinement also starts from the prior's pose. ``ok`` and ``probability`` depend on the pairs
+                alone. If the noise is unknown, the refinement with a prior assumes a standard deviation of one pixel.
             dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
             fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out. To keep such pixels, pass bearings.
-            cam_from_rig: the transform from a rig of several cameras to the camera of each pair,
+            cam_from_rig: the transform from the frame of a rig (several cameras) to the frame of each pair's camera,
                 :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The solved pose is then the pose of the rig.
             first_stage_only: return the first guess without refinement (the paper's "Net"), as with ``m=0``.
             gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`. ``None``: the solver's own option.
@@ -234,11 +236,11 @@ class PnPNet(PretrainedMixin):
         Raises:
             ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or a number of pairs that the
                 initialiser was not built for.
-            TypeCheckError: for arguments that are not tensors, or hold booleans or complex numbers.
+            TypeCheckError: for arguments that are not tensors, and for tensors of booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
-            ValueCheckError: when both a sigma and a covariance are given for the pixels or for the points, or for
-                arguments that cannot be combined (an unknown focal length with distortion or a rig, a rig with
-                alternatives).
+            ValueCheckError: when a sigma and a covariance are both given for the pixels or for the points, or when
+                arguments cannot be combined: an unknown focal length with distortion or with a rig, and a rig with
+                alternatives.
         """
         size, inputs = checked_inputs(
             world_points,
@@ -301,9 +303,10 @@ class PnPNet(PretrainedMixin):
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
         """Compile the solver in place with ``torch.compile``: the first stage, an iteration, and the final stage.
 
-        The first call compiles for some seconds. A new number of pairs, a new dtype, or gradients cause a new
-        compilation. A new batch size does not. Parts that cannot be compiled (RANSAC; all parts without a C++
-        compiler or before PyTorch 2.13) run uncompiled after one warning. A copy of the solver compiles again.
+        The first call compiles for some seconds. A new number of pairs, a new dtype, or the first call with gradients
+        causes a new compilation. A new batch size causes none. Parts that cannot be compiled run uncompiled after one
+        warning: RANSAC always, and all parts without a C++ compiler or before PyTorch 2.13. A copy of the solver
+        compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
@@ -324,7 +327,7 @@ class PnPNet(PretrainedMixin):
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma, self.radial)
         # A network's poses fit the nominal focal length, but a caller's pose does not. Poses of `find_focal`, which
-        # replace doubted poses, are refined by residual.
+        # replace doubted poses, are refined by iterations that ignore the initialiser's weights (`by_residual`).
         given = inputs.init is not None or inputs.prior is not None
         free = trait(self.init, "estimates_noise") and self.refine.by_residual and not given
         if free and not self.radial:

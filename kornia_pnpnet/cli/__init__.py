@@ -1,4 +1,4 @@
-"""The command ``pnpnet``. The docstring of a subcommand's module is its help, and ``run`` returns the exit code.
+"""The command ``pnpnet``. Each subcommand is a module: its docstring is the help, and ``run`` returns the exit code.
 
 The modules import PyTorch inside ``run``, so that errors in arguments appear at once.
 """

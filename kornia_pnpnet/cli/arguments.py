@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-# Largest standard deviation of the logarithm of a focal length. A larger number must be a focal length in pixels.
+# Largest standard deviation of the logarithm of the focal length for `--focal`. A larger number must be a focal length
+# in pixels.
 _MOST_SIGMA = 3.0
 
 #: Names of synthetic data for ``--data``.
@@ -83,7 +84,7 @@ def _source(text: str) -> str:
 
 
 def _arg(help_: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
-    """Make options of ``ArgumentParser.add_argument``. The help text ends with the default."""
+    """Make options of ``ArgumentParser.add_argument``. The help text ends with the default, if there is one."""
     return {"help": f"{help_}; default: %(default)s" if "default" in more else help_, "metavar": metavar, **more}
 
 

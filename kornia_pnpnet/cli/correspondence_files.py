@@ -24,11 +24,11 @@ class ImageCorrespondences(NamedTuple):
 
     world_points: Tensor  # (N, 3)
     img_points: Tensor  # pixels, (N, 2)
-    weights: Tensor  # at least 0, (N,); 1 without weights in the file
+    weights: Tensor  # at least 0, (N,); all 1 if the file has no weights
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort pixels (``kornia_pnpnet.data.colmap.undistort``). Pixels without a solution get the weight 0."""
+        """Undistort pixels (``kornia_pnpnet.data.colmap.undistort``). Pixels that have no solution get the weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:

@@ -73,7 +73,7 @@ def _result(row: Mapping[str, Any]) -> str:
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first problem with the most outliers. The choice does not depend on the solver."""
+    """Draw the first of the problems with the most outliers. The choice does not depend on the solver."""
     import torch
 
     from kornia_pnpnet.cameras import reproject

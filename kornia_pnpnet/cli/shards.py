@@ -54,7 +54,7 @@ def solve_shards(
 
     A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. An NPZ shard is read
     as a whole. Its arrays have the same names: ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally
-    ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma`` and ``world_sigma`` of (), (B,) or (B, N).
+    ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma`` and ``world_sigma``, each (), (B,) or (B, N).
 
     Only complete results files appear. A repeated call skips the shards that have results. Shards that cannot
     be read are reported.
@@ -69,8 +69,8 @@ def solve_shards(
         progress: show a progress bar if stderr is a terminal and tqdm is installed.
 
     Raises:
-        InputError: when there is no shard, two results would have the same name, ``out`` is the folder of a shard, or a
-            shard has results of another solver.
+        InputError: when there is no shard, when two results would have the same name, when ``out`` is the folder of a
+            shard, or when a shard has results of another solver.
         OSError: when the results cannot be written.
     """
     parameters = digest(*chain.from_iterable(sorted(solve.solver.state_dict().items())))
@@ -116,7 +116,7 @@ def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
 
 
 def _solver_of(target: Path) -> bytes | None:
-    """The metadata entry ``_SOLVER`` of a file; ``None`` when the file is not a results file."""
+    """Return the metadata entry ``_SOLVER`` of a file, or ``None`` when the file is not a results file."""
     with suppress(pa.ArrowException, OSError):
         return (parquet.read_schema(target).metadata or {}).get(_SOLVER)
     return None

@@ -42,7 +42,7 @@ _ADVICE = {
     "offset before they become float32",
     "behind": "the points are behind the camera; check the axes: x to the right, y down, z forward",
 }
-# Largest plausible noise, and smallest plausible share of inliers. Files with a wrong convention violate a limit.
+# Largest plausible noise, and smallest plausible share of inliers. A file with a wrong convention violates one of them.
 _MOST_NOISE_PX, _LEAST_SHARE = 10.0, 0.5
 _MISTAKES = (
     "swapped columns, another image size, y up? try --diagnose; many outliers? try --solver p3p-ransac:threshold=PX"

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-#: Number of changes of the poses, ``ok`` or ``probability`` of solvers. Raise the number with each such change,
+#: Number of times that the poses, ``ok`` or ``probability`` of solvers changed. Raise the number with each such change,
 #: so that a test can find results files that are too old. Files without a number were measured before the first change.
 BEHAVIOUR = 1
 

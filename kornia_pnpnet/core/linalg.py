@@ -77,7 +77,7 @@ def lengths(vectors: Tensor) -> Tensor:
 
 
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide values (B, N) by the largest ``size`` of their problem, or by 1 if it is 0."""
+    """Divide values (B, N) by the largest ``size`` of their problem, or by 1 if this largest size is 0."""
     largest = size.amax(1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
@@ -238,7 +238,7 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def span_a_plane(centred: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-    """Tell whether points span more than a line, and whether by more than the rounding of coordinates, bool (B,) each.
+    """Tell whether points span more than a line, and whether they do so by more than rounding errors, bool (B,) each.
 
     ``centred`` has points (3, N, B) minus their mean. The coordinates before centring are at most 1, and padding is 0.
     ``share`` (B,) is the inverse of the number of points.

@@ -99,7 +99,7 @@ def problems_last(tree: _T) -> _T:
 def repeat_problems(tree: _T, count: int) -> _T:
     """Repeat the batch of each non-scalar tensor ``count`` times, in the memory layout of :func:`problems_last`."""
 
-    def repeat(x: Tensor) -> Tensor:  # `Tensor.repeat` compiles to one division per entry
+    def repeat(x: Tensor) -> Tensor:  # not `Tensor.repeat`, which compiles to one division per entry
         if are_few(x):
             return torch.cat((x,) * count)
         last = _reversed(x)[..., None, :]
@@ -219,9 +219,9 @@ def _take_pairs(values: Tensor, index: Tensor) -> Tensor:
     return values.permute(2, 1, 0).gather(1, index.mT.expand(values.shape[-1], -1, -1))
 
 
-# A compiler cannot fuse a custom operation with the operations that read its result. With a fused gather, the compiled
-# hypotheses of the set network take a third longer. `torch.library.Library` replaces `torch.library.custom_op`, whose
-# first call imports 800 modules in 2 to 3 s.
+# A compiler cannot fuse a custom operation with the operations that read its result. With a fused gather, compiled code
+# takes a third longer for the hypotheses of the set network. `torch.library.Library` is used, because the first call of
+# `torch.library.custom_op` imports 800 modules in 2 to 3 s.
 _LIBRARY = torch.library.Library("kornia_pnpnet", "DEF")
 _LIBRARY.define("take_pairs(Tensor values, Tensor index) -> Tensor")
 _LIBRARY.impl("take_pairs", _take_pairs, "CompositeExplicitAutograd")
@@ -356,7 +356,8 @@ def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
 # a graph on the stack if the graph never calls PyTorch. A package of `pnpnet-n9` for one problem then takes 42 instead
 # of 297 µs.
 
-# Longest inline sort or cumulative sum. Longer ones call PyTorch: an inline sort compares each number with all others.
+# Largest size of an inline sort or cumulative sum. For larger sizes, the graph calls PyTorch, because an inline sort
+# compares each number with all others.
 _FEW_INLINE = 32
 
 

@@ -77,7 +77,7 @@ class Symmetric3(NamedTuple):
 
     def divided(self, length: Tensor) -> Symmetric3:
         """Divide a covariance by a squared length, and add more than the rounding errors to its diagonal."""
-        # An entry of 0 gives the length no gradient. The gradient would be NaN if the square of the length underflowed.
+        # Entries of 0 give the length no gradient, because it would be NaN if the square of the length underflowed.
         lengths = (torch.where(x == 0, length.detach(), length) for x in self)
         xx, xy, xz, yy, yz, zz = (x / unit / unit for x, unit in zip(self, lengths, strict=True))
         more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()

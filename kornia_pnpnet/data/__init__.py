@@ -1,7 +1,7 @@
 """Sources of problems: synthetic problems and real scenes.
 
-A source is a class with ``batch_size`` and ``batch(index)``. Constructors raise ``BaseError`` for a number or a range
-out of its bounds.
+A source is a class with ``batch_size`` and ``batch(index)``. Constructors raise ``BaseError`` when a number or a range
+is out of bounds.
 """
 
 from kornia_pnpnet.data.colmap import load_scene

@@ -24,14 +24,15 @@ _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
     """Load a scene from a COLMAP model, or from a file of unfiltered 2D-3D matches with the true poses.
 
-    The model is in the folder ``path`` or in its sub-folder ``dslr_calibration_undistorted`` (ETH3D), ``sparse/0`` or
-    ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image observes a point
-    twice, the first pixel is used. Points behind the camera and NaN pixels are dropped. All pairs count as inliers.
+    The model is in the folder ``path`` or in one of its sub-folders ``dslr_calibration_undistorted`` (ETH3D),
+    ``sparse/0`` and ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image
+    observes a point twice, the first pixel is used. Points behind the camera and points with NaN pixels are dropped.
+    All pairs of a model count as inliers.
 
-    A file of matches is an ``.npz`` file of V images. The file has the arrays ``names`` (V,), ``K`` (V, 3, 3),
-    ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with width and height. All other names start with the index
-    of an image in three digits. For example, the M matches of image 7 are ``007_img_points`` (M, 2),
-    ``007_world_points`` (M, 3) and ``007_error_px`` (M,). The error is the reprojection error under the true pose.
+    A file of matches is an ``.npz`` file with the matches of V images. It has the arrays ``names`` (V,),
+    ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with width and height. The names of all other
+    arrays start with the three-digit index of an image. For example, the M matches of image 7 are ``007_img_points``
+    (M, 2), ``007_world_points`` (M, 3) and ``007_error_px`` (M,), which are reprojection errors under the true pose.
 
     Args:
         path: the folder or the file.
@@ -73,7 +74,7 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Two float64 tensors. The first, (3, 3), is the matrix of the pinhole camera with the same focal length and
-        principal point. The second, (N, 2), has the undistorted pixels, NaN where the camera model has no inverse.
+        principal point. The second, (N, 2), has the undistorted pixels; they are NaN where the model has no inverse.
 
     Raises:
         ImportError: if ``pycolmap`` is missing.
@@ -125,7 +126,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
     pycolmap = _pycolmap()
     try:
         model = pycolmap.Reconstruction(str(place))
-    except Exception as error:  # pycolmap raises many types of errors on bad files, also MemoryError
+    except Exception as error:  # pycolmap raises many types of errors on bad files, even MemoryError
         raise ValueError(f"pycolmap cannot read the model: {_line(error)}") from error
     xyz_of = {number: point.xyz for number, point in model.points3D.items()}
     for image in model.images.values():
@@ -139,7 +140,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
         intrinsics, pixels = _pinhole(image.camera, distorted)
         world_to_cam = image.cam_from_world().matrix()  # (3, 4)
         depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
-        # `~(depth <= 0)` keeps points whose depth is NaN, so that `View` refuses the pose, which is not finite.
+        # If a pose is not finite, depths are NaN. `~(depth <= 0)` keeps these points, so that `View` refuses the pose.
         seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
         arrays = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
         world, img, camera, rotation, translation = (torch.tensor(x, device="cpu") for x in arrays)

@@ -82,7 +82,7 @@ def random_poses(
     translation_sigma: float | None = None,
     max_angle: float = math.pi / 2,
 ) -> Pose:
-    """Draw world-to-camera poses. The defaults are the protocol's distribution.
+    """Draw world-to-camera poses. The defaults give the distribution of the paper's protocol.
 
     The axis of the rotation has a uniform direction, and the angle is uniform from 0 to ``max_angle`` radians. The
     translation is uniform in a cube of side ``translation_box`` about 0, or normal with the standard deviation

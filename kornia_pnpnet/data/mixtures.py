@@ -21,7 +21,7 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["MixedPoints", "MixedProblems", "VaryingSize"]
 
-# The seed that draws the numbers of pairs is `seed` plus this offset. Sources use `seed`, `seed + 1` and so on.
+# `VaryingSize` draws its numbers of pairs with the seed `seed + _SIZES`. Its sources use `seed`, `seed + 1` and so on.
 _SIZES = 1_000_003
 
 
@@ -38,7 +38,7 @@ class MixedProblems:
         options: further arguments of all constructors.
 
     Raises:
-        BaseError: by ``batch``, when only some sources give covariances.
+        BaseError: raised by ``batch`` when only some sources give covariances.
 
     Example:
         >>> from functools import partial
@@ -69,7 +69,7 @@ class MixedProblems:
 
     def batch(self, index: int) -> Problems:
         """Draw a batch; the first index is 0."""
-        count = len(self.sources)  # distinct indices, so that no two sources draw the same random numbers
+        count = len(self.sources)  # each part has its own index, so that no two sources draw the same random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
         KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must give covariances, or none of them.")
@@ -95,7 +95,7 @@ def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], 
 
 
 def _alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Give the field ``name`` equally many dimensions in all parts. If only some parts lack the field, they get NaN."""
+    """Give the field ``name`` equally many dimensions in all parts. Parts that lack it get NaN, unless all lack it."""
     values = [getattr(part, name) for part in parts]
     dimensions = {0 if value is None else value.ndim for value in values}
     if len(dimensions) == 1:

@@ -31,38 +31,38 @@ __all__ = [
 Range: TypeAlias = tuple[float, float]
 
 # The numbers below are choices that cover scenes from a flat picture on a wall to a street. Lengths are in metres.
-_SLAB_WINDOW = (0.15, 0.8)  # half the size of the window in x / z and y / z
+_SLAB_WINDOW = (0.15, 0.8)  # half the size of the slab's window in x / z and y / z
 _SLAB_TANGENT = 0.9  # largest |x / z| and |y / z| of a point
 _SLAB_DISTANCE = (10.0, 40.0)
 _TILT = 0.5  # standard deviation of a slab's slope
-_THICKNESS = (0.02, 4.0)  # of a slab, divided by its distance
+_THICKNESS = (0.02, 4.0)  # thickness of a slab, divided by the slab's distance
 _LEAST_SURFACE = 0.3  # smallest depth of a slab's surface, divided by the distance of the slab
-_OBJECT_DISTANCE = (1.5, 40.0)  # divided by half the size of the object
+_OBJECT_DISTANCE = (1.5, 40.0)  # distance of an object, divided by half the size of the object
 _OBJECT_TANGENT = 0.8  # largest |x / z| and |y / z| of an object's centre
 _THINNEST = 0.05  # smallest ratio of a shorter axis of an object to its longest axis
 _PLANAR = 0.15  # share of planar objects
 _FACADE_DISTANCE = (4.0, 60.0)
 _SLANT = 70.0  # largest angle in degrees between the normal of a façade and the optical axis
-_RELIEF = (0.001, 0.1)  # of a façade, divided by its depth
+_RELIEF = (0.001, 0.1)  # relief of a façade, divided by the façade's depth
 _CORNER = 0.3  # share of problems with two façades
 # Smallest ratio of a façade's distance to the depth of a point. Rays that miss the façade also get this ratio.
 _LEAST_FACING = 0.05
 _ROOM_SIDE = (2.0, 15.0)
 _ROOM_HEIGHT = (2.2, 5.0)
-_FURNITURE = 4  # pieces
+_FURNITURE = 4  # number of pieces of furniture
 _NEAREST = 0.15  # smallest depth of furniture, divided by the depth of the surface behind. Closer hits are ignored
-_CAMERA_HEIGHT = (1.0, 3.0)  # above the street
+_CAMERA_HEIGHT = (1.0, 3.0)  # height of the camera above the street
 _STREET_SIDE = (2.5, 20.0)  # distance of the house fronts
 _STREET_END = (30.0, 200.0)  # distance of the end of the street
 _YAW = 15.0  # standard deviation of the camera's yaw, in degrees
 _NEARER = 0.3  # share of points on cars and trees
 _NOWHERE = 1e6  # height of a street's box, so large that no ray reaches the top
-# Largest field of view in degrees. A pinhole camera needs less than 180.
+# Largest field of view in degrees. A pinhole camera needs a field of view below 180 degrees.
 _WIDEST = 170.0
-# Depth maps: standard deviation of each coordinate of a map camera about the query camera, relative to the mean
+# Depth maps: standard deviation of each coordinate of a map camera relative to the query camera, divided by the mean
 # distance of the points. Map and query camera then see a point from directions that differ by 10 to 40 degrees.
 _BASELINE = 0.3
-# Depth maps: bounds of the change of a flying pixel's distance from its map camera, as a share of the distance.
+# Depth maps: bounds, as shares of the distance, of the change of a flying pixel's distance from its map camera.
 _FLIGHT = (-0.3, 0.6)
 
 
@@ -74,7 +74,7 @@ class PointPrior(Protocol):
 
 
 class BoxPoints:
-    r"""The protocol's points: uniform in a box in front of the camera.
+    r"""The points of the paper's protocol: uniform in a box in front of the camera.
 
     Args:
         half_width: largest :math:`|x|` and :math:`|y|`, in the unit of the world.
@@ -163,15 +163,15 @@ class _View:
 
 
 class FacadePoints(_View):
-    """Points of one façade, or of two façades that meet at a corner, with relief.
+    """Points of one façade with relief, or of two such façades that meet at a corner.
 
-    Each façade is a plane that is turned away from the camera by a random angle. A random half of the points lies
-    deeper by the relief, as in recesses. All depths also get normal noise, with a standard deviation of a tenth of the
-    relief.
+    Each façade is a plane that is turned away from the camera by a random angle. About half of the points, chosen at
+    random, lie deeper by the relief, as in recesses. All depths also get normal noise, with a standard deviation of a
+    tenth of the relief.
 
     Args:
-        field_of_view: range of the field of view of the square image in degrees, uniform.
-        window: range of the ratio of the window's area to the image's area, log-uniform. All points lie in the window.
+        field_of_view: range, in degrees, from which the field of view of the square image is drawn uniformly.
+        window: range from which the window's share of the image area is drawn log-uniformly. All points lie in it.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -218,8 +218,8 @@ class RoomPoints(_View):
 class DrivePoints(_View):
     """Points seen from a car: the road, the house fronts on both sides and the end of the street.
 
-    The camera looks approximately along the street. Some points are closer than the surface behind, like points on cars
-    and trees. For the arguments see :class:`FacadePoints`.
+    The camera looks approximately along the street. Some points are closer than the surface behind them, as points on
+    cars and trees are. For the arguments see :class:`FacadePoints`.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -247,15 +247,16 @@ class DepthMaps:
 
     Each world point comes from the depth map of one of ``maps`` cameras near the query camera. Three errors occur:
 
-    - noise along the ray of the map camera. The standard deviation is :math:`a d^2 / \bar d` at the distance
-      :math:`d`, because the noise of stereo and structured light grows with the square of the distance.
-    - the error of the map camera's rotation. This error turns all points of one map about the map camera;
-    - *flying pixels*: at the edge of an object, the measured distance lies between object and background. These pairs
-      are outliers.
+    - noise along the ray of the map camera. Its standard deviation is :math:`a d^2 / \bar d` at the distance :math:`d`
+      from the map camera, because the noise of stereo and structured light grows with the square of the distance. Here,
+      :math:`\bar d` is the mean distance of the points from the query camera.
+    - the error of the map camera's rotation. This error turns all points of one map about the map camera.
+    - *flying pixels*: at the edge of an object, the measured distance lies between object and background. Pairs with a
+      flying pixel are outliers.
 
     Args:
-        depth_noise: range of :math:`a`, the noise at the mean distance :math:`\bar d` divided by :math:`\bar d`. Each
-            problem draws a log-uniform number.
+        depth_noise: range of :math:`a`, the ratio of the standard deviation at the distance :math:`\bar d` to this
+            distance. Each problem draws a log-uniform number.
         angle: range of the standard deviation of a map camera's rotation error about each axis, in degrees. Each
             problem draws a log-uniform number.
         flying_share: probability that a point is a flying pixel.
@@ -273,9 +274,9 @@ class DepthMaps:
         check_whole(1, maps=self.maps)
 
     def __call__(self, cam_points: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw the moves of points in the query camera's frame, (B, N, 3), float64.
+        """Draw the displacements of points in the query camera's frame, (B, N, 3), float64.
 
-        Also tell whether each point is a flying pixel, bool, (B, N, 1).
+        Also return whether each point is a flying pixel, bool, (B, N, 1).
         """
         batch_size, n, _ = cam_points.shape
         each, one = (batch_size, n, 1), (batch_size, 1, 1)

@@ -96,24 +96,24 @@ class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
     Each problem consists of ``n`` random points of a random image and their pixels. ``outliers`` changes the pixels of
-    some pairs: a *mismatch* gets the pixel of a spare point of the same image, and a *sensing* outlier gets a uniform
-    pixel. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points and poses do not depend
-    on ``outliers``.
+    some pairs. A *mismatch* gets the pixel of a spare point, a point of the same image that is in no pair. A *sensing*
+    outlier gets a uniform pixel. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points
+    and poses do not depend on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
-    this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`.
+    this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`, where :math:`(R, t)` is the image's pose.
 
     Args:
         scene: the scene. Images with fewer than ``n + num_spares`` points are not used.
         n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`SyntheticProblems`.
-        outliers: number of outliers and share of mismatches; no outliers are added when ``None``. Scenes of raw matches
+        outliers: number of outliers and share of mismatches. ``None`` adds no outliers, but scenes of raw matches
             already contain outliers.
         num_spares: number of spare points per problem. Mismatches get the pixels of the spare points in turn. With one
             spare point, as in the protocol, all mismatches of a problem share a pixel.
 
     Raises:
-        BaseError: for ``outliers`` with *near* or *structured* outliers or crowds.
+        BaseError: when ``outliers`` asks for *near* outliers, *structured* outliers or crowds.
         ValueError: if no image has enough points.
     """
 
@@ -170,9 +170,9 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
-        last = counts - k + i  # grows with i, so `last` was not chosen before
+        last = counts - k + i  # `last` grows with i, so `last` was not chosen before
         candidate = (draws[:, i] * (last + 1)).long()
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)
-    # Floyd's algorithm draws a uniform set, but its order is not uniform. Each row is therefore shuffled.
+    # Floyd's algorithm draws a uniformly random set, but in an order that is not uniform. Each row is then shuffled.
     return chosen.gather(1, unit((len(counts), k), generator).argsort(1))

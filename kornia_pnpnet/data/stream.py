@@ -18,7 +18,7 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
 
-# Number of batches that each worker draws in advance. A worker then has enough work during a validation.
+# Number of batches that each worker draws in advance. A worker then stays busy while the caller runs a validation.
 _AHEAD = 4
 
 
@@ -57,7 +57,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         num_workers=workers,
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
-        generator=torch.Generator(),  # else the loader would draw from PyTorch's global generator
+        generator=torch.Generator(),  # otherwise the loader would draw from PyTorch's global generator
         # In processes of joblib, the default start method is joblib's own. A loader cannot use this method.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
@@ -69,7 +69,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         for batch in arrays:
             yield tree_map_only(np.ndarray, torch.from_numpy, batch)
     finally:
-        end_workers()  # else a traceback that refers to `arrays` keeps the workers alive
+        end_workers()  # otherwise a traceback that refers to `arrays` keeps the workers alive
 
 
 def _draw_arrays(source: ProblemSource, index: int) -> Any:

@@ -32,18 +32,18 @@ _AMOUNTS = {"img_sigma": _ANY, "world_sigma": _ANY, "degrees": (1.0, math.inf), 
 _MOST_RATIO = 100.0
 # Largest pixel noise of an inlier with Student noise, in units of `img_sigma`. A choice.
 _MOST_NOISE = 10.0
-# Smallest divisor in pixels: replaces a standard deviation of 0.
+# Smallest divisor in pixels. It replaces a standard deviation of 0.
 _TINY = 1e-9
 # Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87°.
 _LEAST_COSINE = 0.05
-# Half the side of the largest image if `half_image` is `None`, at a focal length of 1. Some points may lie outside.
+# At a focal length of 1, half the side of the largest image if `half_image` is `None`. Some points may lie outside.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
-# Number of first pairs of a problem that are never copies. A choice: eight pairs can still determine a pose.
+# Number of leading pairs of a problem that are never copies. A choice: eight pairs can still determine a pose.
 _LEAST_ORIGINALS = 8
 # Largest blur in `_bunched`, relative to the mean distance. A choice: at a blur of 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
 # Choices for confidences.
-_SEPARATION = (0.0, 4.0)  # distance between the mean scores of inliers without noise and of outliers
+_SEPARATION = (0.0, 4.0)  # mean score of inliers without noise minus mean score of outliers
 _NOISINESS = (0.0, 1.0)  # decrease of an inlier's score when log(1 + noise) grows by 1
 _GAIN = (0.3, 3.0)  # factor from scores to logits
 _OFFSET = 1.5  # standard deviation of the offset of the logits
@@ -55,47 +55,49 @@ _HALF_IMAGE = 1000.0
 
 @dataclass(kw_only=True, eq=False)
 class SyntheticProblems(RandomProblems):
-    r"""Random, reproducible problems of the protocol: ``seed`` and ``i`` determine batch ``i``.
+    r"""Random, reproducible problems of the paper's protocol: ``seed`` and ``i`` determine batch ``i``.
 
     Points are drawn in the camera's frame. The inverse of a random pose transforms the points to the world frame. World
-    coordinates and pixels get noise, and some pairs become outliers. The defaults are the protocol's distribution
+    coordinates and pixels get noise, and some pairs become outliers. The defaults give the protocol's distribution
     without outliers. A range is two numbers between which each problem draws a log-uniform number.
 
     Args:
         n: number of pairs per problem.
         batch_size: number of problems per batch.
         seed: seed of the stream.
-        points: prior of the points in the camera's frame; ``BoxPoints()`` when ``None``.
-        outliers: number and kinds of outliers; no outliers when ``None``.
+        points: prior of the points in the camera's frame. ``None`` means ``BoxPoints()``.
+        outliers: number and kinds of outliers. ``None`` means no outliers.
         translation_sigma: standard deviation of each coordinate of normal translations. With ``None``, translations are
             uniform in a cube of side 25 about 0.
         max_angle: largest rotation angle in radians.
-        focal: focal length in pixels; the principal point is 0.
-        half_image: half the side of the image in pixels. The pixels of *sensing* outliers are uniform in the image, a
-            square about 0. ``None`` means the smallest square that contains the pixels of all points of a problem, with
-            a field of view of at most 120°.
-        img_sigma: standard deviation of the noise on each pixel coordinate in pixels, or a range.
+        focal: focal length in pixels. The principal point is the pixel (0, 0).
+        half_image: half the side, in pixels, of the image, which is a square about 0. The pixels of *sensing* outliers
+            are uniform in the image. ``None`` means the smallest square that contains the pixels of all points of a
+            problem, with a field of view of at most 120°.
+        img_sigma: standard deviation, in pixels, of the noise on each pixel coordinate, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
-        degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range; 0 means Gaussian noise. With
-            Student noise, ``img_sigma`` is the scale of the distribution. Pairs with more pixel noise than
-            ``10 * img_sigma`` are then outliers.
-        sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. Above 0,
-            known sigmas have the shape ``(batch_size, n)``.
+        degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range. 0 means Gaussian noise. With
+            Student noise, ``img_sigma`` is the scale of the distribution, and pairs with more pixel noise than
+            ``10 * img_sigma`` are outliers.
+        sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. With a spread
+            above 0, the sigmas of a batch have the shape ``(batch_size, n)``.
         axis_ratio: ratio of the largest to the smallest standard deviation over the random axes of a pair's noise, at
-            most 100. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the axes, known noise is
-            given as covariances, and ``known_noise`` must be 0 or 1.
-        known_noise: share of the problems that have both sigmas. With 0, batches have no sigmas. Above 0, a third of
-            the other problems have one sigma, and each missing sigma is NaN.
-        confidence_share: share of the problems that have confidences; other problems have NaN. With 0, batches have no
-            confidences. The separation of inliers from outliers and the scale of the logits differ between problems.
-        bunched_share: share of the problems in which the inliers and the *near* and *structured* outliers are bunched
+            most 100. If it is above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the axes, known
+            noise is given as covariances, and ``known_noise`` must be 0 or 1.
+        known_noise: share of the problems that come with both sigmas. With 0, batches have no sigmas. Above 0, a third
+            of the other problems come with one of the two sigmas, and each missing sigma is NaN.
+        confidence_share: share of the problems that have confidences. The confidences of other problems are NaN. With
+            0, batches have no confidences. The separation of inliers from outliers and the scale of the confidences'
+            logits differ between problems.
+        bunched_share: share of the problems in which all inliers, *near* outliers and *structured* outliers are bunched
             in one part of the image. The points of all other outliers come from the rest of the scene.
         depth_maps: errors of world points that depth cameras have measured, in addition to ``world_sigma``. Known noise
             does not include these errors. ``None`` means no errors of depth cameras.
-        copies_share: share of the problems with copies, as from detectors that list a place several times. In these
-            problems, a pair is a copy of another pair with a probability of up to 0.5. The first 8 pairs are no copies.
-        dtype: dtype of the batches; numbers are drawn in float64.
-        device: device of the batches; numbers are drawn on the CPU.
+        copies_share: share of the problems with copies of pairs, as from detectors that list a place several times. In
+            such problems, a pair is a copy of another pair with a probability of up to 0.5. The first 8 pairs are never
+            copies.
+        dtype: dtype of the batches. Numbers are drawn in float64.
+        device: device of the batches. Numbers are drawn on the CPU.
 
     Example:
         >>> problems = SyntheticProblems(n=9, batch_size=2, seed=1, outliers=OutlierMix(count=3)).batch(0)
@@ -202,7 +204,7 @@ class SyntheticProblems(RandomProblems):
         is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
         other = (n * unit((size, n), generator)).long()
         index = torch.where(is_copy, other, torch.arange(n))
-        # With n = 3, poses and cameras are also indexed, but do not change: the first 8 pairs are never copies.
+        # With n = 3, poses and cameras also have this shape. They do not change: the first 8 pairs are never copies.
         return problems.map(lambda x: x[torch.arange(size)[:, None], index] if x.shape[1:2] == (n,) else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
@@ -216,7 +218,7 @@ class SyntheticProblems(RandomProblems):
         return half * uniform(shape, -1.0, 1.0, generator)
 
     def _bunched(self, scene: Tensor, displaced: Tensor, generator: torch.Generator) -> Tensor:
-        """Reorder points, (B, 2N, 3). All pairs get points of a bunch, except the outliers ``displaced``, (B, N)."""
+        """Reorder points, (B, 2N, 3). All pairs get points of a bunch, except the outliers in ``displaced``, (B, N)."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
         # The score of a point is the distance of its direction from the direction of the first point, plus blur.

@@ -44,12 +44,12 @@ class KnownInliersAndNoise(Configured):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
     The variance is :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2`, where
-    :math:`J_x` is the Jacobian of the pixel with respect to the world point at the true pose. Covariances of the
-    problems replace the sigmas and whiten the residuals; the result is then the maximum likelihood estimate.
+    :math:`J_x` is the Jacobian of the pixel with respect to the world point at the true pose. If the problems have
+    covariances, these replace the sigmas and whiten the residuals. The result is then the maximum likelihood estimate.
 
     Args:
         img_sigma: standard deviation of a pixel coordinate. The default is the value of the protocol's synthetic data.
-        world_sigma: standard deviation of a world coordinate; see ``img_sigma``.
+        world_sigma: standard deviation of a world coordinate. The default is also the protocol's value.
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both are 0.

@@ -75,9 +75,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A pose that is not finite is replaced by the identity, with ``ok`` false. Summaries are computed from errors that
-    are rounded to six significant digits. The results file is written after every row. A call with the same arguments,
-    or with further solvers and data sets, continues the file. The file of any other evaluation is refused.
+    A pose that is not finite is replaced by the identity, and its ``ok`` is false. Summaries are computed from errors
+    that are rounded to six significant digits. The results file is written after every row. A call with the same
+    arguments, or with further solvers and data sets, continues the file. The file of any other evaluation is refused.
 
     Args:
         solvers: solvers by name, called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode without
@@ -127,7 +127,7 @@ def evaluate(
     results["left_out"] = []
     elsewhere = {key: here[key] for key in _MACHINE if results["environment"].get(key) != here[key]}
     if path is not None:
-        save_results(results, path)  # an error of writing appears here, before the work
+        save_results(results, path)  # a failure to write appears here, before the work
 
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}

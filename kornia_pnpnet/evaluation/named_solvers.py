@@ -30,12 +30,12 @@ _COMPETITORS = (
     *("kornia-rs", "poselib", "pycolmap"),
 )
 # Options of RANSAC for real scenes. The threshold is the best of a grid from 3 to 60 px on five scenes with 0, 2 and 4
-# outliers in 9 pairs; the seed is not `DEFAULT_SEED`. Success hardly changes from 6 to 20 px.
+# outliers in 9 pairs, drawn with another seed than `DEFAULT_SEED`. Success hardly changes from 6 to 20 px.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
-# Options of RANSAC for synthetic data. The thresholds are the best of a grid from (3 px, 0.15 m) to (8 px, 0.4 m);
-# the seed is not `DEFAULT_SEED`. Success varies by one percentage point over the grid.
+# Options of RANSAC for synthetic data. The thresholds are the best of a grid from (3 px, 0.15 m) to (8 px, 0.4 m), on
+# problems of another seed than `DEFAULT_SEED`. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
 # Module and name of each optional package, keyed by the start of the names of its solvers.
 _PACKAGES = {peer.source[1].lower(): peer.source for peer in (OpenCVPnP, KorniaRs, PoseLib, PyColmap)}

@@ -63,8 +63,8 @@ def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejec
 
     Args:
         path: the file to write.
-        img_points: pixels, shape (N, 2). Pixels that are not finite are left out; ``ValueError`` if no pixel is finite.
-        reprojections: reprojected points in pixels, shape (N, 2), not finite for points behind the camera.
+        img_points: pixels, shape (N, 2). Pixels that are not finite are left out. If all are, ``ValueError`` is raised.
+        reprojections: reprojected points in pixels, shape (N, 2). For points behind the camera, they are not finite.
         rejected: whether a pair is rejected, bool, shape (N,).
         title: first part of the title.
     """
@@ -132,7 +132,7 @@ def plot_errors(path: str | Path, results: Mapping[str, Any]) -> Path:
 
 
 def _panels(results: Mapping[str, Any]) -> tuple[dict[str, list[Mapping[str, Any]]], dict[str, str]]:
-    """Group the rows by data set, and choose a colour for each solver. Raise ``ValueError`` without rows."""
+    """Group the rows by data set, and choose a colour for each solver. Raise ``ValueError`` if there are no rows."""
     panels: dict[str, list[Mapping[str, Any]]] = {}
     for row in results["rows"]:
         panels.setdefault(row["data"], []).append(row)

@@ -29,7 +29,7 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
-# Problems per drawn batch. The fixed size makes a set of 100 problems the start of a set of 1000 problems.
+# Problems per drawn batch. This number is fixed, so that a set of 100 problems is the start of a set of 1000 problems.
 _DRAW_BATCH = 1000
 
 
@@ -82,8 +82,8 @@ def evaluation_sets(
         dtype: dtype of the problems, which are drawn in float64 and then converted.
 
     Returns:
-        Sets by name, one for each combination of source, n and outliers. A description has ``source`` (name of the
-        prior or the scene), ``outliers``, ``mismatch_share``, ``seed`` and, for a scene, ``path``.
+        Sets by name, one for each combination of source, n and outliers. The description of a set has ``source`` (name
+        of the prior or of the scene), ``outliers``, ``mismatch_share``, ``seed`` and, for a scene, ``path``.
 
     Raises:
         BaseError: for invalid sources, outliers or ``n``.
@@ -113,7 +113,7 @@ def evaluation_sets(
                     prior, make = PRIORS[source]
                     problems = draw_problems(make(**options, **noise, batch_size=_DRAW_BATCH), count)
                     origin = {"source": prior}
-                else:  # mismatches get the pixels of spare points; `mismatches_only` needs one for each mismatch
+                else:  # mismatches get the pixels of spare points; `mismatches_only` needs a spare point for each
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
                     views = SceneProblems(scene, num_spares=spares, **options, batch_size=_DRAW_BATCH)
                     problems, origin = draw_problems(views, count), {"source": scene.name, "path": source}

@@ -31,7 +31,7 @@ _SHOWN_DIFFERENCES = 3
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
-    """Read the errors (float64) and ``ok`` (bool) of all problems of a row, each :math:`(B,)`.
+    """Read the errors (float64) and ``ok`` (bool) of all problems of a row, each of the shape :math:`(B,)`.
 
     Raise ``ValueError`` for a row without per-problem errors. The repository's results files have only summaries.
     """
@@ -84,7 +84,7 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
     """Fill ``plan``, which has no rows, with the rows of the file at ``path``. A missing file is ignored.
 
-    If code, versions, solvers or data sets of the file differ from ``plan``, ``ValueError`` names some differences.
+    If the file's code, versions, solvers or data sets differ from ``plan``, a ``ValueError`` names some differences.
     """
     fresh: dict[str, Any] = json.loads(json.dumps(plan))  # tuples become lists, as in a file
     there = load_results(path) if Path(path).exists() else fresh

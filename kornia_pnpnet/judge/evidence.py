@@ -1,9 +1,9 @@
 r"""The evidence for a pose: how much likelier the pairs are with this pose than without a pose.
 
-The residual of an inlier is Gaussian. One of ten inliers has three times the standard deviation. The pixel of an
-outlier is uniformly distributed. Let :math:`w` be the share of inliers, :math:`s` a factor of all variances, and
-:math:`d_i(s)` the density of pair :math:`i` as an inlier, divided by its density as an outlier. The log-likelihood
-ratio
+The residual of an inlier is Gaussian. One inlier in ten has three times the standard deviation of the others. The
+pixel of an outlier is uniformly distributed. Let :math:`w` be the share of inliers, and let :math:`s` multiply all
+variances. Let :math:`d_i(s)` be the density of pair :math:`i` as an inlier, divided by its density as an outlier. The
+log-likelihood ratio
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
@@ -11,9 +11,9 @@ leaves out its three largest terms, because some pose fits any three pairs. The 
 number of pairs with about the same pixel and point. Expectation-maximisation (EM) estimates :math:`w`. If the noise is
 unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1 or, with lower prior probability, a power of 8.
 
-The *evidence* is the logarithm of the mean of :math:`\exp L(s)`, weighted by the prior probability of :math:`s`, minus
-the logarithms of the number of minimal samples and of the number of poses per sample. A pose is *believed* if the
-evidence suffices and the inliers determine the pose accurately.
+The mean of :math:`\exp L(s)` is weighted by the prior probability of :math:`s`. The *evidence* is the logarithm of this
+mean, minus the logarithm of the number of minimal samples, minus the logarithm of the number of poses per sample. A
+pose is *believed* if the evidence suffices and the inliers determine the pose accurately.
 
 The results have no gradient.
 """
@@ -51,47 +51,47 @@ __all__ = [
     "updated",
 ]
 
-# Grid of an unknown noise: its smallest standard deviation, in radians.
+# Smallest standard deviation in the grid for unknown noise, in radians.
 _LEAST_ANGLE = 1e-4
-# Ratio of neighbouring variances.
+# Ratio of neighbouring variances in the grid.
 _STEP = 8.0
-# Number of variances. The largest standard deviation is 0.018, or 14 pixels at a focal length of 800 pixels.
+# Number of variances in the grid. The largest standard deviation is 0.018, or 14 pixels for a focal length of 800 px.
 _SCALES = 6
-# If the caller gave the noise, `s = 8^k` has the prior log-probability k times this number.
+# If the caller gave the noise, `s = 8^k` has a prior log-probability of k times this number.
 _UNEXPECTED = -3.0
-# Rounds of EM for the share of inliers at each factor, and rounds for the final factor and share.
+# Rounds of EM that estimate the share of inliers at each fixed `s`, and final rounds that estimate both `s` and share.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
-# The wide component of the inliers, for the heavy tails of real residuals: its share of the inliers, and the factor of
-# its variance. Without this component, success on indoor RGB-D matches falls by 2.5 percentage points.
+# For the heavy tails of real residuals, the share `_TAIL` of the inliers (the wide component) has `_WIDE` times the
+# variance of the others. Without this component, success on indoor RGB-D matches falls by 2.5 percentage points.
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
-# Pairs are copies if both pixels and both points are in the same cell of a grid. The sizes of a cell are in focal
-# lengths and in units of the normalised world.
+# Two pairs are copies if their pixels are in one cell of a grid, and their points are in one cell of another grid. The
+# sizes of the cells are in focal lengths for pixels, and in units of the normalised world for points.
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Largest number of poses of a minimal sample.
 _POSES = 4
-# Rows are sorted by a key, the sum of their columns times powers of this number, so that equal rows are adjacent. The
+# To make equal rows adjacent, rows are sorted by a key: the sum of their entries times powers of this number. The
 # number is transcendental, so that different rows of integers have different keys.
 _KEY = math.pi / 4
 
 #: A pose is believed when its :func:`probability` is at least this value.
 LEAST_PROBABILITY = 0.9
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
-#: logarithm of ``sigma``. ``python docs/results/make.py measure --only probability`` fitted the law.
+#: logarithm of ``sigma``. ``python docs/results/make.py measure --only probability`` fitted these numbers.
 LAW = (-1.573, 0.6221, -0.4594)
-# Ranges to which the variables of the law are clipped.
+# Ranges to which the variables of `LAW`, the evidence and the logarithm of sigma, are clipped.
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
-#: Largest errors of a correct pose: of the rotation in radians, and of the translation as a share of the distance.
+#: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
 # Largest `pose_sigma` of a pose that is believed. The unit of `pose_sigma` is the largest error of a correct pose.
 _OPEN = 0.5
 # Largest standard deviation of plausible noise in radians. With 0.0125, 4 % of correct poses of indoor RGB-D matches
 # (`rgbd/indoor.npz`, without a ratio test) would not be believed.
 _MOST_NOISE = 0.016
-# A point lies off a line if its distance exceeds this factor times the standard deviation of the points along the line.
+# A point lies off a line if its distance from it exceeds this factor times the standard deviation along the line.
 _OFF = 0.05
-# The required number of points off the line is the number of inliers minus this number, at least 1, at most 3.
+# The required number of points off the line is the number of inliers minus this number, but at least 1 and at most 3.
 _FEW = 5
 # Rounds of the robust fit of the line.
 _LINE_ROUNDS = 3
@@ -103,8 +103,8 @@ class Votes(NamedTuple):
     Attributes:
         pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
         known: whether the caller gave any noise of the problem, bool (B, 1).
-        outlier: density of an outlier's pixel, divided by the maximum of the narrow component of an inlier's density,
-            for a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
+        outlier: density of an outlier's pixel, divided by the largest value of the narrow component of an inlier's
+            density. This ratio is for a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
     """
 
     pairs: Tensor
@@ -134,7 +134,7 @@ class AtPose(NamedTuple):
         exponent: minus half the squared residual over the variance of its pixel, about -∞ behind the camera, (B, N).
         density: the square root of the determinant of ``precision``, (B, N) or (1, 1).
         outlier: ``Votes.outlier`` divided by ``density``, (B, N) or (B, 1).
-        precision: inverse variance of each pixel, (B, N) or (1, 1), or inverse covariance.
+        precision: inverse variance, (B, N) or (1, 1), or inverse covariance of each pixel.
     """
 
     projection: Projection
@@ -166,7 +166,7 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Relative densities (B, N) of inliers, of inliers with the components divided by 1 and 9, and of outliers."""
+        """Relative densities (B, N) of inliers, of inliers if the wide component is divided by 9, and of outliers."""
         # `exp2` is faster than `exp`, which takes 50 times as long on a CPU where the result underflows (MKL).
         scaled = exponent / (math.log(2.0) * self.variance)
         narrow, wide = scaled.exp2(), (scaled / _WIDE).exp2()
@@ -175,7 +175,7 @@ class Mixture(NamedTuple):
         return inlier, weighted, (self.variance / self.share - self.variance) * outlier
 
     def weights(self, seen: AtPose) -> Tensor:
-        """Robust weights (B, N): the derivatives of the negative log-likelihood, at most 1."""
+        """Robust weights (B, N), at most 1: derivatives of the negative log-likelihood by ``-exponent / variance``."""
         inlier, weighted, outlier = self.densities(seen.exponent, seen.outlier)
         return weighted / (inlier + outlier)
 
@@ -185,10 +185,10 @@ class Evidence(NamedTuple):
 
     Attributes:
         log_ratio: the evidence, shape (B,).
-        grid: :math:`L` plus the prior log-probability of each factor, shape (B, F).
+        grid: :math:`L(s)` plus the prior log-probability of :math:`s`, for each :math:`s`, shape (B, F).
         mixture: the estimated distribution of the residuals.
         inlier: probability that a pair is an inlier, shape (B, N).
-        radian: factor of the variances at which the geometric mean of the standard deviations is one radian, (B, 1).
+        radian: the :math:`s` at which the geometric mean of the pixels' standard deviations is one radian, (B, 1).
         sigma: the standard deviation of a pixel in radians, estimated from the inliers, shape (B,).
     """
 
@@ -207,7 +207,7 @@ class Evidence(NamedTuple):
 
 @torch.no_grad()
 def copies(rows: Tensor, there: Tensor) -> Tensor:
-    """For each row of (B, N, C), the number (B, N) of equal rows among the rows ``there`` (B, N), at least 1."""
+    """Count, for each row of (B, N, C), the equal rows among those ``there``, bool (B, N). Each count is at least 1."""
     key = _KEY ** torch.arange(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     order = (rows * key).sum(-1).argsort(1)
     ordered = rows.gather(1, order[..., None].expand_as(rows))
@@ -242,7 +242,7 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
     log_ratio = likelihood.logsumexp(0)[:, 0] - (_POSES / 6.0 * samples).log()
     best = likelihood.argmax(0, keepdim=True)
     variance, share = (x.gather(0, best)[0] for x in (factors, share))
-    # At the smallest angle of the grid, the bound is about 0, because the noise can be smaller than the grid.
+    # At the smallest angle of the grid, the bound is about 0, because the noise can be smaller than this angle.
     least = torch.where(best[0] > 0, _STEP**-0.5 * variance, torch.finfo(share.dtype).eps ** 2 * variance)
     mixture = Mixture(variance, share, least, total)
     for _ in range(_FINAL_ROUNDS):
@@ -319,7 +319,7 @@ def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
     """Standard deviation of the pose in units of the largest errors of a correct pose, float64, (B,).
 
-    The variance is the sum for rotation, translation and an unknown focal length (as a change of the distance).
+    The variance sums the variances of rotation, translation and an unknown focal length (as a change of the distance).
     ``precision`` is the inverse variance (or covariance) of each pixel in px^-2, (B, N), 0 for outliers. The result is
     infinite for an undetermined pose.
     """
@@ -379,7 +379,7 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
         centred = world - (share * world).sum(1, keepdim=True)
         matrix = (centred[:, None] * (share * centred)).sum(2)  # (3, 3, B)
         matrix = matrix / matrix.amax((0, 1))
-        # The direction of the line is the first eigenvector. The fourth power of the matrix maps ones close to it.
+        # The line follows the first eigenvector. The fourth power of the matrix maps (1, 1, 1) close to this direction.
         matrix = (matrix[:, :, None] * matrix).sum(1)
         direction = (matrix * matrix.sum(1)).sum(1)
         direction = direction / direction.norm(dim=0)

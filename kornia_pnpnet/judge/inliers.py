@@ -1,8 +1,8 @@
 r"""Find the inliers of a pose by thresholds.
 
 A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
-:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. The ratio of both sides is the
-*standardised* squared residual.
+:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. The left side divided by the
+right side is the *standardised* squared residual.
 """
 
 from __future__ import annotations

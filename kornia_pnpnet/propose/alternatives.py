@@ -25,28 +25,28 @@ __all__ = ["find_alternatives", "reconsider"]
 _LIKELY = 1e-3
 # The logarithm of the ratio is clipped at this number, so that the exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum if two differences are below this number: the angle between the rotations in radians,
-# and the distance between the positions of the mean point, divided by the distance of the mean point from the camera.
+# Two poses are the same minimum if this number exceeds both the angle, in radians, between the rotations and the shift
+# of the mean point in the camera frame, divided by the distance of the mean point from the camera.
 _SAME = 0.035
 # A mirror image is refined if most inliers have residuals below this number times the spread of the inliers' pixels.
 _NEAR_MIRROR = 0.2
-# Rivals are other poses that may explain the pairs. Least initial noise of the rival with a larger noise, in radians.
+# Rivals are other poses that may explain the pairs. One rival starts with a noise of at least this number of radians.
 _WIDE_ANGLE = 6.4e-3
-# First entry of `Evidence.grid` with at least this noise.
+# Index of the first entry of `Evidence.grid` with at least this noise.
 _WIDE_FROM = 4
 # This rival is tried only if the larger noise lowers the log-likelihood by less than this number per vote.
 _GAP = 0.4
 # This rival is tried only if the share of inliers is below this number.
 _CLEAR = 0.9
-# Divisor of the initial variance of a given rival (argument `rival` of `reconsider`), if the noise is unknown.
+# Divisor of the variance with which a given rival (argument `rival` of `reconsider`) starts, if the noise is unknown.
 _SMALLER = 4.0
 # A given rival is tried only if its rotation differs from the pose by more than this angle, in radians.
 _APART = 0.02
 # A given rival is tried only if the share of inliers is below this number.
 _CLEAR_OF_RIVALS = 0.97
-# Iterations of a rival: first with constant noise, then with estimated noise.
+# Numbers of iterations of a rival: first with constant noise, then with estimated noise.
 _FROZEN, _FREE = 3, 5
-# Iterations from each start in `find_alternatives`.
+# Number of iterations from each start in `find_alternatives`.
 _ITERATIONS = 12
 
 
@@ -59,7 +59,7 @@ def find_alternatives(
     The refinement starts from the mirror image of the pose, from the P3P solutions of three pairs that lie far apart,
     and from the poses of ``starts``. When the camera sees a plane almost from the front, the mirror image can be nearly
     as likely as the pose without being a minimum. If the refinement of the mirror image ends at the pose, the unrefined
-    mirror image is therefore used. Problems that are not ``valid`` (B,) have no other poses.
+    mirror image is therefore used. Problems that are not ``valid``, bool (B,), get no other poses.
     """
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
     plan = refine.begin(problem, starts._replace(pose=pose, others=None, camera=None))
@@ -110,12 +110,12 @@ def reconsider(
     rival: State | None = None,
     replaced: Tensor | None = None,
 ) -> tuple[Progress, Evidence, Tensor | None]:
-    """Compare refined poses with rivals, and keep the likeliest pose if ``refine.by_residual`` is positive.
+    """Compare refined poses with rivals. If ``refine.by_residual`` is positive, each problem keeps its likeliest pose.
 
-    If the noise is unknown, one rival starts from the refined pose with a larger noise that is almost as likely. One
-    rival starts from the mirror image of the pose, if the mirror image has small residuals. A given rival is used if
-    its rotation differs from the pose. If the noise is unknown, a given rival starts with a smaller noise. A rival that
-    ends more than 10 degrees from the result lowers the probability of the result.
+    If the noise is unknown and a larger noise is almost as likely, one rival starts from the refined pose with the
+    larger noise. One rival starts from the mirror image of the pose, if the mirror image has small residuals. A given
+    rival is used if its rotation differs from the rotation of the pose. If the noise is unknown, a given rival starts
+    with a smaller noise. A rival that ends more than 10 degrees from the result lowers the probability of the result.
 
     Args:
         refine: the refiner.
@@ -123,14 +123,14 @@ def reconsider(
         now: the refined poses.
         found: the evidence for the refined poses.
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
-        rival: given rivals, such as those of ``search_on``. ``None``: no given rivals.
+        rival: given rivals, such as those of ``search_on``. ``None``: there are no given rivals.
         replaced: whether the given rival replaces the refined pose of a problem, bool, shape :math:`(B,)`. Such a rival
             starts with the noise of its own residuals. The given rivals of all other problems are ignored.
             ``None``: the likelihood selects the pose of every problem.
 
     Returns:
-        For :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for them, and their
-        log-odds against the rivals; ``None``: no problem has a rival.
+        The arguments of :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for the
+        states, and the log-odds of the states against the rivals, or ``None`` if no problem has a rival.
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
     with torch.no_grad():
@@ -185,7 +185,7 @@ def reconsider(
 
 
 def _shares(weights: Tensor) -> Tensor:
-    """Weights (B, N) divided by their sum."""
+    """Divide the weights (B, N) of each problem by their sum."""
     return weights / weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
 
 
@@ -219,7 +219,7 @@ def _half_turn(axis: Tensor) -> Tensor:
 
 
 def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor, ...]:
-    """Solve P3P for three likely pairs that lie far apart. ``fallback`` replaces invalid poses among the four."""
+    """Find four poses by P3P from three likely pairs that lie far apart. ``fallback`` replaces invalid poses."""
     likely = weights * (weights > 0.5 * weights.amax(1, keepdim=True))
     points, rows = problem.world_points, torch.arange(len(weights), device=weights.device)[:, None]
 

@@ -30,14 +30,14 @@ __all__ = ["ControlPoints", "EPnP", "control_points"]
 
 # Points are planar when their smallest extent is below this fraction of their middle extent.
 _PLANAR_RATIO = 1e-3
-# Least number of pairs, and least number of pairs in front of the camera, of a problem that is `ok`.
+# A problem that is `ok` has at least _MIN_PAIRS pairs, and at least _MIN_IN_FRONT of them are in front of the camera.
 _MIN_PAIRS, _MIN_IN_FRONT = 4, 3
 # Number of Gauss-Newton steps of each of the four cases, before the best case is chosen.
 _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Ridge, divided by the squared spread of the pixels. The ridge sorts null vectors of equal algebraic errors: null
-# vectors along the longest extents of the world come first.
+# Ridge, divided by the squared spread of the pixels. If null vectors have equal algebraic errors, the ridge sorts them:
+# null vectors along the longest extents of the world come first.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
@@ -111,7 +111,7 @@ class EPnP(Initialiser):
         iterations: number of Gauss-Newton steps, at least 2. Each case takes two steps, and the best case takes the
             remaining steps.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
-            distances, in a world of the root mean square radius 1. The paper's weight is 0.
+            distances, in a world with a root mean square radius of 1. The paper's weight is 0.
 
     Raises:
         BaseError: when an argument is out of its range.
@@ -136,7 +136,7 @@ class EPnP(Initialiser):
         self.algebraic_weight = algebraic_weight
 
     def forward(self, problem: Problem) -> Starts:
-        """Find the pose in the solver's frame. All returned weights are 1. A pose that is not ``ok`` is also finite."""
+        """Find the pose in the solver's frame. All returned weights are 1. Poses that are not ``ok`` are finite too."""
         problem = problem._replace(weights=problem.usual_weights)
         control = control_points(problem)
         system = _depth_system(control, problem, self.algebraic_weight)
@@ -177,7 +177,7 @@ class EPnP(Initialiser):
 
 
 class _DepthSystem(NamedTuple):
-    """The equations of the four depths. For the symbols see the module."""
+    """The equations of the four depths. The docstring of the module defines the symbols."""
 
     coordinates: Tensor  # a, (4, N, B)
     weights: Tensor  # w, normalised to the sum 1, (N, B)
@@ -255,7 +255,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
 
 
 def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Half the matrix (4, 4, C, B) and gradient (4, C, B) of `_minimize`, and its misfit DᵀD - LᵀL (3, 3, C, B)."""
+    r"""Half the matrix (4, 4, C, B), half the gradient (4, C, B) and misfit DᵀD - LᵀL (3, 3, C, B) of `_minimize`."""
     vectors = _in_camera(system, depths)[:, 1:]
     columns = vectors.transpose(0, 1)
     misfit = small_product(columns, vectors) - system.gram
@@ -267,7 +267,7 @@ def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Ten
 
 
 def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
-    r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` (the paper has six distances)."""
+    r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` (the paper compares six distances)."""
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(system, depths)
         (step,) = solve_leading([row.unbind(0) for row in normal.unbind(0)], gradient.unbind(0), (4,))
@@ -276,7 +276,7 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 
 
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
-    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem, and 0 to minima that are not isolated.
+    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem, or 0 where a minimum is not isolated.
 
     Two Newton steps with a constant matrix make first and second derivatives exact. The values do not change.
     """

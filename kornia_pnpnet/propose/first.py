@@ -78,7 +78,7 @@ def propose(
 
 @torch.no_grad()
 def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool) -> Starts:
-    """Find the pose of a rig, the inliers, and the noise of their residuals if ``with_noise``. See `propose`."""
+    """Find pose and inliers of a rig, and the noise of the inliers' residuals if ``with_noise``. See `propose`."""
     problem = problem.map(torch.Tensor.detach)
     if fixed or not sees_values(problem.weights):
         starts = _of_fixed_effort(problem._replace(weights=relative(problem.weights, problem.weights), noise=None))

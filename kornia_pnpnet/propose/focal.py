@@ -26,8 +26,8 @@ __all__ = ["as_dist", "distorted", "find_focal", "scale_focal", "with_found_foca
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
-# Ratio that estimates half the width of the image from the median distance (maximum norm) of pixels from its centre, if
-# the pixels are uniformly distributed in a square.
+# If pixels are uniformly distributed in a square image, half the width of the image is the median distance (maximum
+# norm) of the pixels from the centre, times this number.
 _HALF_WIDTH = math.sqrt(2.0)
 # Half the range of log f in standard deviations, if the caller expects a focal length.
 _SEARCHED = 2.0
@@ -38,20 +38,21 @@ _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 _FURTHER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, min_samples=64, final_steps=1)
 # Number of steps of `_with_distortion`.
 _STEPS = 14
-# Lower bound of the kernel's scale in the first step, in focal lengths: k1 = 0.2 shifts a pixel at a radius of 0.7 by
-# 0.2 * 0.7^3 = 0.07.
+# Lower bound, in focal lengths, of the kernel's scale in the first step. For example, a distortion of k1 = 0.2 shifts a
+# pixel at a radius of 0.7 by 0.2 * 0.7^3 = 0.07.
 _WIDE = 0.07
-# Factor of this bound from step to step, and its least value.
+# After each step, this bound is multiplied by _SHRINK, but it never falls below _LEAST.
 _SHRINK, _LEAST = 0.6, 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> Inputs:
-    """Replace each focal length by the middle of the range of the search, and set ``free_focal``.
+    """Replace each focal length by the middle of the searched range, and describe this range in ``free_focal``.
 
-    With ``sigma``, the standard deviation of log f, the range lies around the caller's focal length. Otherwise the
-    range is proportional to the size of the image. The size is twice the principal point or, if larger, an estimate
-    from the median distance of the pixels. Aspect ratio and signs of fx and fy are kept. Matrices that are no pinhole
-    cameras become NaN. ``radial`` is the number of coefficients of radial distortion to estimate.
+    If ``sigma``, the standard deviation of log f, is given, the range lies around the caller's focal length. Otherwise
+    the range is proportional to the size of the image. The size is twice the principal point or, if larger, an estimate
+    from the median distance of the pixels from the principal point. The aspect ratio and the signs of fx and fy are
+    kept. Matrices that are no pinhole cameras become NaN. ``radial`` is the number of coefficients of radial distortion
+    to estimate.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = focal_length(camera)  # (B,)
@@ -100,7 +101,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     if radial:
         with torch.no_grad():
             problem, frame = normalize(*inputs[:5])
-            # These steps use the prior of the distortion. The refinement also uses the prior of the focal length.
+            # `_with_distortion` uses only the prior of the distortion. The refinement also uses the prior of log f.
             known = known._replace(information=torch.zeros_like(zoom)).scaled(frame.img_scale)
             at = _with_distortion(problem._replace(free_focal=known), frame.apply(pose), radial)
             finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()
@@ -114,7 +115,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 @torch.no_grad()
 def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, Tensor]:
-    """Run RANSAC on ``doubted`` problems, bool (B,), whose refined poses are not ``ok``, and replace these states.
+    """Run RANSAC on ``doubted`` problems, bool (B,), whose refined poses are not ``ok``, and replace their states.
 
     Also returns for which problems RANSAC found a pose, bool (B,). All other problems keep their states.
     """
@@ -136,7 +137,7 @@ def _zoomed(inputs: Inputs, zoom: Tensor) -> Inputs:
 
 
 def distorted(problem: Problem, coefficients: Tensor) -> Problem:
-    """Apply radial distortion (B, K) to undistorted pixels and their noise."""
+    """Apply radial distortion with the coefficients (B, K) to undistorted pixels and to their noise."""
     p, q = (problem.img_points / problem.focal).unbind(-1)
     square = torch.addcmul(p * p, q, q)
     stretch, slope = torch.ones_like(square), torch.zeros_like(square)
@@ -162,7 +163,7 @@ def as_dist(coefficients: Tensor) -> Tensor:
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
     """Estimate pose, focal length and radial distortion by Gauss-Newton steps with a Cauchy kernel.
 
-    The scale of the kernel is proportional to the median residual. Its lower bound shrinks from step to step.
+    The scale of the kernel is proportional to the median residual. The lower bound of this scale shrinks at each step.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
     limit = _WIDE

@@ -19,14 +19,14 @@ class Initialiser(Configured):
 
     Attributes:
         pairs_at_once: on a CPU and without gradients, solvers split a batch into parts that fit the CPU's caches. This
-            is the largest number of pairs of a part, per thread. ``None``: batches are not split.
+            attribute is the largest number of pairs in a part, per thread. ``None``: batches are not split.
         fixed_pairs: whether the number of pairs has to be ``config["n"]``.
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.
         finds_focal: whether the initialiser estimates an unknown focal length.
         estimates_noise: whether the result contains several poses and the noise. Such an initialiser accepts
             ``forward(problem, search_follows=True)``.
-        weighs_unusual: whether the weights of unusual pairs (see ``Problem.usual``) are final, or `propose` sets them.
+        weighs_unusual: whether the weights of unusual pairs (``Problem.usual``) are final. If not, `propose` sets them.
     """
 
     pairs_at_once: int | None = None

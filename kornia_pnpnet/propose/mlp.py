@@ -62,12 +62,12 @@ class MLPInit(Initialiser):
     branch follow. Each branch has five ReLU layers of 2n units and a linear last layer. The rotation branch returns an
     axis :math:`s` and an angle :math:`\theta`. The rotation is :math:`R = \exp(\theta [s / \|s\|]_\times)`.
 
-    Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are ours. The network computes in its own dtype
-    or in the dtype of the problem, whichever is wider.
+    Source: Sheffer and Wiesel 2020, figure 2. The scales of the input are our addition. The network computes in its own
+    dtype or in the dtype of the problem, whichever is wider.
 
     Args:
         n: number of pairs.
-        world_scale: divisor of the world coordinates. The value 1 is for a centred and scaled world.
+        world_scale: divisor of the world coordinates. The value 1 suits a centred and scaled world.
         img_scale: divisor of the image coordinates, in pixels.
 
     Raises:

@@ -7,8 +7,8 @@ length of the difference of the unit rays :math:`i` and :math:`j`. The law of co
 .. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k.
 
 If weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three equations is a conic in the ratios of
-the distances. With the squared sines :math:`s_k` of the angles between the rays and the squared determinant :math:`g`
-of the rays, the conic is a pair of lines when
+the distances. Let :math:`s_k` be the squared sines of the angles between the rays, and :math:`g` the squared
+determinant of the rays. Then the conic is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3.
 
@@ -37,18 +37,18 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["P3P", "minimal_poses", "p3p"]
 
-# Size in bytes of a vector with one number per problem of a chunk. A core's caches hold a few dozen of these vectors.
+# A vector with one number per problem of a chunk has this size in bytes. A core's caches hold a few dozen such vectors.
 _CHUNK_BYTES = 2**16
 # A candidate is a solution if its triangle differs from the world triangle by less than eps^_ERROR_POWER times the
 # distance of the camera, and by less than _LARGEST_ERROR. The longest edge of the world triangle has the length 1.
 _ERROR_POWER, _LARGEST_ERROR = 2 / 3, 0.01
-# Least distance of the camera from a point, divided by eps^_ERROR_POWER times the longest edge. At a smaller distance,
+# Least distance of the camera from a point, in units of eps^_ERROR_POWER times the longest edge. At a smaller distance,
 # rounding would determine the ray of the point.
 _CLOSE = 64.0
 # A triangle counts as a line when its height is below _LINE * eps * sqrt(b^2 + d^2). Here b is the longest edge, and d
 # is the distance of the opposite point from the origin.
 _LINE = 32.0
-# Number of Newton steps for the root of the cubic, which reduce a relative error of 37 % to rounding in float64.
+# Number of Newton steps for the root of the cubic. They reduce a relative error of 37 % to rounding errors of float64.
 _CUBIC_STEPS = 4
 # A Newton step for the ratios is damped if its squared determinant is below eps^_DAMPING_POWER times the product of two
 # squared edges. When two solutions nearly coincide, rounding errors would dominate the full step.
@@ -63,13 +63,13 @@ def _greater(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether one cyclic shift brings the largest of three values (3, C) to the front, and whether two do, (C,)."""
+    """Which cyclic shift moves the largest of three values (3, C) to the front: flags (C,) for one and two steps."""
     first, second, third = values
     return _greater(second, first), _greater(third, torch.maximum(first, second))
 
 
 def _turned(triple: Tensor, turn: tuple[Tensor, Tensor], step: int = 1) -> Tensor:
-    """Shift triples (3, *, C) cyclically by the flags ``turn``. With ``step=-1``, undo the shift."""
+    """Shift triples (3, *, C) cyclically as the flags ``turn`` say. With ``step=-1``, undo the shift."""
     return triple.lerp(triple.roll(-step, 0), turn[0]).lerp_(triple.roll(step, 0), turn[1])
 
 
@@ -86,9 +86,10 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 
 
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
-    """The real root ``u : v`` of a cubic form (4, C) that is farthest from the other two roots.
+    """Find the real root ``u : v`` that is farthest from the other two roots of a cubic form with coefficients (4, C).
 
-    If two solutions of P3P nearly coincide, two roots also do. The other root gives a line through both solutions.
+    If two solutions of P3P nearly coincide, two roots also nearly coincide. The other root gives a line through both
+    solutions.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -118,8 +119,8 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
     r"""Slopes (2, C) and offsets (2, C) of the two lines of the degenerate conic with the weights ``u`` (3, C).
 
     The lines are :math:`\lambda_1 - \lambda_3 = \text{slope}\,(\lambda_2 - \lambda_3) + \text{offset}\,\lambda_3`.
-    The sum ``u[1] + u[2]`` must not be small. ``h`` (3, C) is 1 minus the cosines of the angles between rays. ``pairs``
-    (C,) is :math:`u_1 u_2 + u_2 u_3 + u_3 u_1`.
+    The sum ``u[1] + u[2]`` must not be small. ``h`` (3, C) is 1 minus the cosine of each angle between two rays.
+    ``pairs`` (C,) is :math:`u_1 u_2 + u_2 u_3 + u_3 u_1`.
     """
     tiny = torch.finfo(pairs.dtype).tiny
     # The matrix D of the conic has u_2 + u_3, u_3 + u_1, u_1 + u_2 on its diagonal and -u_k cos_k off the diagonal. The
@@ -228,7 +229,8 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """For triangles given by a base and another side, both (3, *, C), compute lengths and directions.
 
-    Returns unit vectors along base and height, 1 / base, the component of the side along the base, and height².
+    Returns unit vectors along the base and along the height, 1 divided by the length of the base, the component of the
+    side along the base, and the squared height.
     """
     tiny = torch.finfo(base.dtype).tiny
     inv_base = _dot(base, base).clamp_(min=tiny).rsqrt_()
@@ -331,9 +333,10 @@ class _Solve(torch.autograd.Function):
 
 
 def minimal_poses(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype. Fifth powers must not overflow or underflow.
+    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype.
 
-    Returns the entries (12, 4, B) of :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which slots are valid, (4, B).
+    The fifth powers of coordinates must not overflow or underflow. Returns the entries (12, 4, B) of
+    :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which slots are valid, (4, B).
     """
     entries, valid = (_solve if compiling() else _Solve.apply)(world_points.detach(), plane_points.detach())
     return entries, valid

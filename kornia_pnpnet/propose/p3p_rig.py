@@ -60,7 +60,7 @@ class _Branches(NamedTuple):
         return cls(ahead, 1.0 + gain, offset - ahead * ray, change - gain * ray, sq_side)
 
     def interval(self) -> tuple[Tensor, Tensor]:
-        """Least and largest distance of pair 1 with real solutions. Without real solutions, the least is larger."""
+        """Least and largest distance of pair 1 with real solutions. If none is real, the least exceeds the largest."""
         sq_tilt = self.tilt.square().sum(0).clamp(min=torch.finfo(self.tilt.dtype).eps ** 2)  # for parallel rays
         middle = -(self.aside * self.tilt).sum(0) / sq_tilt
         sq_half = middle.square() + (self.sq_side - self.aside.square().sum(0)) / sq_tilt
@@ -108,7 +108,7 @@ class P3PRig:
 def _starts(
     branches: list[_Branches], rays: Tensor, centres: Tensor, sq_side: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Distances (M,) of pair 1 close to solutions, their signs (2, M), their slots (M,) and their problems (M,)."""
+    """Starts of Newton's method: distances (M,) of pair 1, signs (2, M) of branches, slots (M,) and problems (M,)."""
     batch, device = sq_side.shape[0], sq_side.device
     lows, highs = zip(*(x.interval() for x in branches), strict=True)
     low, high = torch.maximum(*lows).clamp(min=0.0), torch.minimum(*highs)

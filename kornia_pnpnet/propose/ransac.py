@@ -28,12 +28,13 @@ _FITTED = 5
 # Largest residuals of an inlier in `search_on`, in standard deviations. The first limit is for noise that a network
 # estimates. Such estimates are too small when most pairs are outliers. The second limit is for the caller's noise.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
-# Least inlier threshold for an unknown focal length, divided by the median distance of the pixels from the principal
-# point and by half the range of log f. Tuned on random problems with fields of view of 18 to 100 degrees (seed 6).
+# For an unknown focal length, the inlier threshold is at least this number, times the median distance of the pixels
+# from the principal point, times half the range of log f. Tuned on random problems with fields of view of 18 to 100
+# degrees (seed 6).
 _GRID_RESIDUAL = 0.04
 # Lower bound, in normalised units, of the depth at which `search_on` converts noise of points to pixels.
 _NEAREST = 0.5
-# _DOUBT: chance that a pair of weight 0 is drawn, relative to a pair of weight 1. _LEAST_TRUST: the same ratio for
+# _DOUBT: chance to draw a pair of weight 0, divided by that of a pair of weight 1. _LEAST_TRUST: the same ratio for
 # confidences 0 and 1. This ratio is smaller, because a caller's confidences are more reliable than a network's weights.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
@@ -49,8 +50,8 @@ class RANSAC(Initialiser):
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
     least squares, the weight of an inlier is the inverse of the right-hand side. The final steps multiply this weight
-    by the weight of a Cauchy kernel. They start from a constant pose close to the minimum, and have gradients with
-    respect to points, pixels and weights. The choice of inliers, and the right-hand side, have no gradient.
+    by the weight of a Cauchy kernel. These steps start from a constant pose close to the minimum, and have gradients
+    with respect to points, pixels and weights. The choice of inliers, and the right-hand side, have no gradient.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
@@ -213,7 +214,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     Args:
         problem: normalised problems of a centred and scaled world.
         starts: several poses per problem, and the noise of the pairs. Weights are probabilities that pairs are inliers.
-        keep_others: whether to keep the other poses of the starts. The best pose of few pairs can be incorrect.
+        keep_others: whether to keep the other poses of the starts. With few pairs, the best pose can be incorrect.
 
     Returns:
         First, the starts with the best pose, without gradient. In a searched problem, a Cauchy kernel at the best pose,

@@ -2,8 +2,8 @@ r"""EPPnP and REPPnP: a pose from the null space of the projection equations. RE
 
 A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residuals are the algebraic
 errors. The unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). In an
-array ``rows`` (B, K + 1, 2 N), the first K rows are the derivatives of the errors by K unknowns, and the last row holds
-the errors. In each row, N entries for u precede N entries for v.
+array ``rows`` (B, K + 1, 2 N), the first K rows hold the derivatives of the errors with respect to K unknowns, and the
+last row holds the errors. In each row, N entries for u precede N entries for v.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class REPPnP(Initialiser):
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
     Rejection", CVPR 2014. Our changes improve success or allow batches:
 
-    - The null vector is scaled so that the centroid has depth 1 (paper: length 1). The vector solves a linear system,
-      and does not depend on the control points, the frame or the unit. A small ridge pulls all points toward the depth
-      of the centroid, which reduces the effect of outliers.
+    - The null vector is scaled so that the centroid has depth 1. (In the paper, the vector has length 1.) The vector
+      solves a linear system, and does not depend on the control points, the frame or the unit. A small ridge pulls all
+      points toward the depth of the centroid, which reduces the effect of outliers.
     - Outliers are rejected by their leave-one-out error. The quantile is 50 % (paper: 25 %).
     - A second loop rejects outliers of a rigid motion, fitted by Gauss-Newton to the algebraic error. The final pose
       minimises this error. The paper alternates between a combination of four null vectors and a rigid motion.
@@ -133,7 +133,7 @@ class REPPnP(Initialiser):
         return Starts(pose, kept.to(problem.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs, control: ControlPoints) -> tuple[Tensor, Pose]:
-        """Weights (0 for outliers), and a pose of the kept pairs in the frame of :class:`_Pairs`."""
+        """Return weights, which are 0 for outliers, and the pose of the kept pairs in the frame of :class:`_Pairs`."""
         coordinates = control.coordinates.mT.contiguous()  # (B, 4, N)
         # The mean is subtracted from the pixels. This shear of the camera frame does not change the algebraic errors.
         # In a narrow view the shear reduces rounding.
@@ -142,13 +142,13 @@ class REPPnP(Initialiser):
         by_x, by_y = torch.cat((coordinates, zero), -1), torch.cat((zero, coordinates), -1)
         by_z = -(pairs.plane - mean).flatten(1)[:, None] * coordinates.repeat(1, 1, 2)
         parts = by_x[:, :1], by_y[:, :1], by_x[:, 1:], by_y[:, 1:], by_z[:, 1:], by_z[:, :1]
-        rows, weights = torch.cat(parts, 1), pairs.weights  # the last row is for the centroid's depth, 1
+        rows, weights = torch.cat(parts, 1), pairs.weights  # the last row is for the centroid's depth, which is 1
         for _ in range(_NULL_ITERATIONS if self.reject_outliers else 0):
             inverse, null = _null_vector(rows, weights, _DEPTH_PRIOR)
             errors = _leave_one_out(torch.cat((rows[:, :-1], null.mT @ rows), 1), inverse, pairs, weights)
             sq_size = null[:, 2:-1].square().sum(1).clamp(min=torch.finfo(null.dtype).eps ** 2)
             weights = self._keep(pairs, errors / sq_size, _NULL_FLOOR)
-        # Find the pose that maps the world's points to the points in the camera that the last null vector describes.
+        # Find the pose that maps the world points to the camera points that the last null vector describes.
         _, null = _null_vector(rows, weights, _FINAL_DEPTH_PRIOR)
         centroid, vectors = torch.cat((null[:, :2], null[:, -1:]), 1), null[:, 2:-1].view(-1, 3, 3)
         camera = torch.cat((centroid, vectors), 2)  # (B, 3, 4)
@@ -189,13 +189,13 @@ def _normal_matrix(rows: Tensor, weights: Tensor) -> Tensor:
 
 
 def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
-    """Inverse of the normal matrix plus a ridge and a tiny number, so that the inverse exists."""
+    """Invert the sum of the normal matrix, a ridge and a tiny number. The tiny number makes the inverse exist."""
     ridge = torch.diag_embed(normal.new_zeros(normal.shape[1]) + ridge + 32.0 * torch.finfo(normal.dtype).eps)
     return torch.linalg.inv_ex(normal[..., :-1] + ridge).inverse
 
 
 def _null_vector(rows: Tensor, weights: Tensor, depth_prior: float) -> tuple[Tensor, Tensor]:
-    """Inverse normal matrix (B, 11, 11), and the null vector (B, 12, 1). The last entry is the centroid's depth 1."""
+    """Inverse normal matrix (B, 11, 11), and null vector (B, 12, 1), whose last entry is the centroid's depth, 1."""
     normal = _normal_matrix(rows, weights)
     inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8).to(normal))
     return inverse, torch.cat((-(inverse @ normal[..., -1:]), torch.ones_like(normal[:, :1, :1])), 1)

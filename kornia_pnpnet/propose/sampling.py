@@ -27,13 +27,13 @@ _GOLDEN = 0.6180339887
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
-    """Number of items that are computed at once: ``count`` on a CPU, whose caches limit it, and else 64 ``count``."""
+    """Number of items that are computed at once: ``count`` on a CPU, because of its caches, else 64 times ``count``."""
     return count if like.device.type == "cpu" else 64 * count
 
 
 @torch.no_grad()
 def spread_evenly(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of present pairs, evenly spread. With fewer than ``count`` such pairs, absent pairs follow.
+    """Positions (B, count) of present pairs, evenly spread. If fewer than ``count`` are present, absent pairs follow.
 
     Multiples of the golden ratio shift the positions slightly, so that the selection does not follow a periodic pattern
     in the order of the pairs. No position occurs twice, unless the problem has fewer than ``count`` pairs.
@@ -73,7 +73,7 @@ def draw(numbers: Tensor, upper: Tensor) -> Tensor:
 def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Tensor) -> Tensor:
     r"""Agreement (B, N) between each pair's nearest neighbours in the image and its nearest neighbours in the world.
 
-    An inlier has common neighbours in the image and in the world. An outlier has common neighbours only by chance. A
+    An inlier has neighbours that are common to image and world. An outlier has common neighbours only by chance. A
     common neighbour of rank :math:`a` in the image and rank :math:`b` in the world adds :math:`1 / (1 + \max(a, b))` to
     the agreement. Pairs with equal pixels or points do not count, because they often repeat one incorrect match.
 
@@ -108,10 +108,10 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
 
 
 class Samples:
-    """The samples that RANSAC tries: all subsets of pairs in random order, or ``most`` random samples if more exist.
+    """The samples that RANSAC tries: all subsets of pairs in random order, or ``most`` samples if more subsets exist.
 
     Args:
-        chances: relative chances that pairs are drawn, (B, N); 0: never.
+        chances: relative chances that pairs are drawn, (B, N). A pair with the chance 0 is never drawn.
         size: number of pairs in a sample.
         most: largest number of samples.
         seed: seed of the random numbers, which are the same for every problem.
@@ -149,7 +149,7 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        Unequal chances count as n equal chances, where 1 / n is the mean chance of an inlier, weighted by the chances.
+        Unequal chances count as n equal chances. Here 1 / n is the mean chance of the inliers, weighted by the chances.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
@@ -184,7 +184,7 @@ def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float
     r"""Number of samples needed for a probability ``confidence`` that at least one sample has no outlier, float64 (B,).
 
     The number is :math:`\log(1-p) / \log(1-w)` for the confidence :math:`p`. The share of samples without an outlier is
-    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs, not necessarily integers
+    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs (both may be fractions)
     (M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B).
     """
     drawn = torch.arange(size, dtype=torch.float64, device=inliers.device)

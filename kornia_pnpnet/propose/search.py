@@ -31,19 +31,19 @@ CAUCHY = 3.4
 _DTYPE = torch.float32
 # Largest number of samples that a CPU solves and scores at once, so that the tensors fit into a core's caches.
 _SAMPLES_AT_ONCE = 8192
-# A round has _GROWTH times as many samples as all earlier rounds together, at most _LARGEST_ROUND.
+# A round has _GROWTH times as many samples as all earlier rounds together, but at most _LARGEST_ROUND.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
-# A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds, or are at most _FEW_SAMPLES. The pose of
-# few pairs then does not depend on their order, and rounding does not decide when the search ends.
+# A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds, or are at most _FEW_SAMPLES. With few
+# pairs, the pose then does not depend on the order of the pairs, and rounding does not decide when the search ends.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
-# After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, at least _FIRST_PAIRS. If k
+# After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, but at least _FIRST_PAIRS. If k
 # samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then 3 / w pairs
 # contain at least one inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
 # were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
-# Up to this number of slots times pairs of a problem, scoring the empty slots is faster than removing the empty slots.
+# If a problem has at most this product of slots and pairs, scoring the empty slots is faster than removing them.
 _FEW_RESIDUALS = 4096
 # Number of poses with the smallest losses that each round improves. The best improved pose is then improved again.
 _IMPROVED = 3
@@ -51,7 +51,8 @@ _IMPROVED = 3
 _VECTOR = 64
 # Squared ratio of the thresholds to the narrower thresholds of a rival.
 _NARROWER = 16.0
-# The product of a rotation and of its Newton step is 3. A matrix whose product differs by this number is no rotation.
+# The sum of the products of the entries of a rotation and of its Newton step is 3. If this sum differs from 3 by at
+# least this number, the matrix is no rotation.
 _FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step, small because the start is close to the minimum.
 _DAMPING = 1e-6
@@ -61,8 +62,8 @@ _LIMITS = 3.0, 1.0
 # If `pose_sigma` exceeds _OPEN, an incorrect pose may have as many inliers as the correct pose, for example in a flat
 # scene and a narrow field of view. At least _OPEN_SAMPLES samples are then drawn.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
-# After this number of samples, the chance that a pair is drawn is multiplied by (a + agreement)^b. The samples before
-# take as long as `agreement_of_neighbours`. The numbers a and b were chosen empirically.
+# After this number of samples, the chance that a pair is drawn is multiplied by (a + agreement)^b. These first
+# samples take as long as `agreement_of_neighbours`. The numbers a and b were chosen empirically.
 _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
@@ -90,8 +91,8 @@ class Search:
         problem: problems whose points are centred at the origin, because the search computes in float32.
         thresholds: thresholds of an inlier.
         chances: relative probabilities that pairs are inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
-        sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`; ``None``: estimated from the
-            residuals of the inliers.
+        sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`. ``None``: the search estimates
+            it from the residuals of the inliers.
         finds_rivals: whether the search finds ``rivals``.
 
     Attributes:
@@ -133,7 +134,7 @@ class Search:
         pose, camera = self._state(self.poses.to(self.problem.weights))
         # One Newton step towards the closest orthogonal matrix doubles the number of correct digits.
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
-        # The solution of a degenerate sample, such as rays that rounding makes equal, can be far from a rotation.
+        # If a sample is degenerate, for example if rounding makes rays equal, its solution can be far from a rotation.
         is_rotation = ((rotation * pose.rotation).sum((1, 2), keepdim=True) - 3.0).abs() < _FAR_FROM_ROTATION
         rotation = torch.where(is_rotation, rotation, torch.eye(3, dtype=rotation.dtype, device=rotation.device))
         return State(Pose(rotation, pose.translation), camera)
@@ -147,7 +148,7 @@ class Search:
                 number of samples.
 
         Returns:
-            The indices, in the batch, of the problems of which samples were drawn.
+            The indices in the batch of the problems from which samples were drawn.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -230,8 +231,8 @@ class Search:
     def _expect(self, at: Tensor) -> None:
         """Estimate how many samples some problems need, from the inliers of their best poses.
 
-        After `_prefer_agreement`, the estimate is the geometric mean of the numbers for the old and the new chances. On
-        repeated structure, neighbours of outliers agree. The number for the new chances could then end a search early.
+        After `_prefer_agreement`, the estimate is the geometric mean of the numbers for the old and the new chances. If
+        structure repeats, neighbours of outliers agree too. The number for the new chances could end a search early.
         """
         if not len(at):
             return
@@ -267,7 +268,7 @@ class Search:
         """Find the best poses of the samples ``start`` to ``stop - 1``: ascending losses (P, K), and poses (P, 12, K).
 
         If a problem has many pairs, a few pairs score all poses first. More pairs then score the best poses. The number
-        of first pairs increases with ``start``, because after many samples without success inliers are rare.
+        of first pairs increases with ``start``, because inliers are rare if many samples had no success.
         """
         poses, valid = self._solved(problems, self.samples.positions(problems, start, stop))
         # After its last sample, a problem repeats samples. Its best poses must not depend on the rest of the batch.
@@ -347,7 +348,7 @@ class Search:
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
     """Take one least-squares step. Pairs are weighted by the products of ``weights`` (B, N) and ``problem.weights``.
 
-    If the focal length has a prior, ``variance`` (B, 1) is the variance of a pixel coordinate, which determines the
+    If the focal length has a prior, ``variance`` (B, 1) is the variance of a pixel coordinate. It determines the
     relative weight of the prior. The default is one squared pixel of the caller's image.
     """
     weights = problem.weights * weights
@@ -369,7 +370,8 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
     """Repeat the first row until the number of rows is a multiple of `_VECTOR`, unless each row has many pairs.
 
-    Processors round differently in partly filled vectors, so that results would depend on the position in the batch.
+    Processors round differently in partly filled vectors. Without the repeated rows, results would depend on the
+    position in the batch.
     """
     if compiling() or pairs > _VECTOR:
         return rows

@@ -1,4 +1,4 @@
-"""A network on a set of pairs that estimates poses, weights and noise, for any number and any order of the pairs."""
+"""A network that estimates poses, weights and noise from a set of pairs, for any number and any order of the pairs."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
 # Number of likeliest pairs that score each hypothesis.
 _MOST_JUDGES = 32
-# The squared residual, in variances, that halves the score of a pair.
+# At this squared residual, divided by the variance, the score of a pair is half the score at the residual 0.
 _JUDGED = 50.0
 # Score of a pair of likelihood 0, divided by the score of a pair of likelihood 1.
 _LEAST_VOTE = 0.5
@@ -64,8 +64,8 @@ _LEAST_VOTE = 0.5
 _MANY_SLOTS = 64
 # Least depth, in normalised units, at which the noise of points is converted to pixels.
 _LEAST_DEPTH = 0.5
-# Before a search the network sees at most this number of pairs; the search uses all pairs. On real matches and random
-# problems of up to 1000 pairs, 32 to 96 pairs have the same success as all pairs.
+# If a search follows, the network sees at most this number of pairs, but the search uses all pairs. With 32 to 96
+# pairs, the success is the same as with all pairs, on real matches and on random problems of up to 1000 pairs.
 _ENOUGH = 48
 
 
@@ -94,7 +94,7 @@ class _View:
         plane = functional.pad(problem.img_points / problem.focal, (0, 1), value=1.0)
         self.rays = functional.normalize(plane, dim=-1)
         mean = functional.normalize((share * self.rays).sum(1), dim=-1)
-        # Two reflections rotate the mean ray to the z axis: first to the negative z axis, then z is negated.
+        # Two reflections rotate the mean ray to the z axis: one maps it to the negative z axis, the other negates z.
         half = mean + eye[2]
         mirror = 1.0 - 2.0 * eye[2]
         turn = (half * mirror)[..., None] * (half / half[:, 2:])[:, None]
@@ -122,7 +122,7 @@ class _View:
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 
     def _noise(self, problem: Problem) -> Tensor:
-        """Logarithms of the noise of pixels and points over their spread, and whether the noise is known, (B, N, 4)."""
+        """Logarithms of noise over spread, for pixels and for points, and whether the noise is known, (B, N, 4)."""
         if problem.noise is None:
             return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
@@ -135,7 +135,7 @@ class _View:
 
 @torch.no_grad()
 def _repeats(problem: Problem) -> Tensor:
-    """Logarithms (B, N, 2) of the number of pairs with the same pixel, and the number of pairs with the same point."""
+    """Logarithms (B, N, 2) of the numbers of pairs that share a pair's pixel, and of those that share its point."""
     there = problem.usual_weights > 0
     return torch.stack([copies(x, there) for x in (problem.img_points, problem.world_points)], -1).log()
 
@@ -186,7 +186,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 
 
 def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
-    """The number of pairs from which a problem uses each of S samples, and the 3 S ranks of the samples' pairs."""
+    """The number of pairs that a problem needs to use each of S samples, and the 3 S ranks of the samples' pairs."""
     every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if not search_follows:  # a search draws further samples
         every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
@@ -207,7 +207,7 @@ def _sample_table(count: int, number: int, search_follows: bool, device: torch.d
 
 
 def _support(poses: Tensor, judges: Tensor) -> Tensor:
-    """Scores (H, B) of poses [R | t] (3, 4, H, B) by the pairs ``judges`` (7, K, B)."""
+    """Scores (H, B) that the pairs ``judges`` (7, K, B) give to poses [R | t] (3, 4, H, B)."""
     a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
     first, second, third, translation = poses[:, :, :, None].unbind(1)  # (3, H, 1, B) each
     points = torch.addcmul(translation, first, a)  # (3, H, K, B)
@@ -263,12 +263,13 @@ def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
 
 
 class SetInit(Initialiser):
-    r"""A small network on a set of pairs that estimates several coarse poses, a weight for each pair, and the noise.
+    r"""A small network that maps a set of pairs to several coarse poses, a weight for each pair, and the noise.
 
     In every residual layer, attention pools a context over all pairs. The cost is linear in the number of pairs, and
-    the order of the pairs has no effect. For each hypothesis, the network predicts a weight and a distance of each
-    point from the camera. The pose is the rigid motion that aligns the world points with the points at these distances.
-    Poses are equivariant to similarity transforms of the world, and to rotations of the camera except the roll.
+    the order of the pairs has no effect. For each hypothesis, the network predicts a weight of each point, and the
+    distance of each point from the camera. The pose is the rigid motion that aligns the world points with the points at
+    these distances. Poses are equivariant to similarity transforms of the world, and to rotations of the camera except
+    the roll.
 
     The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`), and score the
     poses of the samples. The best pose is a further hypothesis, and has no gradient.
@@ -330,7 +331,7 @@ class SetInit(Initialiser):
         self.norm = nn.LayerNorm(width)
         # Outputs of a pair: the logit of being an inlier, a weight per hypothesis, and a distance per hypothesis.
         self.pair = nn.Linear(width, 1 + 2 * starts)
-        # Outputs of a problem: the distance of the world's centre per hypothesis, the noise of pixels and of points.
+        # Outputs of a problem: the distance of the world's centre per hypothesis, and the noise of pixels and points.
         self.problem = nn.Linear(width, starts + 2)
         with torch.no_grad():
             for layer, scale in ((self.pair, 0.3), (self.problem, 0.1)):

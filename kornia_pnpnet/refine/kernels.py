@@ -1,8 +1,8 @@
 r"""Robust kernels, which weight a pair by its squared residual, and hyperparameters that are learned within bounds.
 
-A kernel is a loss :math:`\rho(s)` of the squared residual and its derivative :math:`w(s)`. The residual is in pixels of
-the normalised camera or, if the noise is known or estimated, in standard deviations. The *shape* of ``huber``,
-``cauchy``, ``geman_mcclure`` and ``truncated`` is a scale in the unit of the residual. The shape of ``power`` is the
+A kernel has a loss :math:`\rho(s)` of the squared residual :math:`s`, and its derivative :math:`w(s)`. Residuals are in
+pixels of the normalised camera or, if the noise is known or estimated, in standard deviations. The *shape* of a kernel
+is a scale in the unit of the residual (``huber``, ``cauchy``, ``geman_mcclure``, ``truncated``), or for ``power`` the
 exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net. To add a kernel, extend :data:`KERNELS`.
 """
 
@@ -20,7 +20,7 @@ from kornia_pnpnet.core.checks import check_numbers, check_whole
 
 __all__ = ["KERNELS", "POWER_FLOOR", "BoundedParameter", "RobustKernel"]
 
-#: ``power`` adds the square of this number to squared residuals in either unit. The weight at 0 is therefore finite.
+#: ``power`` adds the square of this number (in pixels or sigmas) to squared residuals. The weight at 0 is then finite.
 POWER_FLOOR = 0.1
 # Largest absolute value of a raw parameter. The sigmoid of 1000 rounds to 1 in float64.
 _BOUND = 1e3

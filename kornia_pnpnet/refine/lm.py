@@ -52,7 +52,7 @@ _MAX_RESIDUAL = 2.0
 _ROUNDING = 100.0
 # Estimated noise of the points is replaced by 0 only if the log-likelihood then rises by more than this number.
 _EXPECTED = 2.0
-# Factors of the damping after a rejected and after an accepted step (Marquardt 1963; only with `reject_worse`).
+# The damping is multiplied by these after a rejected and an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
 
@@ -61,14 +61,14 @@ class Plan(NamedTuple):
 
     Attributes:
         problem: the problem with the caller's weights. Its noise is known for every pair or ``None``.
-        prior: weight of each pair in ``judge``, before the robust weight. With iterations by residual (see
-            :class:`RobustWeightedLM`), the caller's weight, else the product of caller's and initialiser's weights.
+        prior: weight of each pair in ``judge``, before the robust weight. This is the caller's weight if there are
+            iterations by residual (see :class:`RobustWeightedLM`), else the caller's times the initialiser's weight.
         guided: the product of the caller's and the initialiser's weights, divided by the largest product.
-        by_residual: with iterations by residual, ``prior`` divided by the mean positive weight, else ``guided``.
+        by_residual: ``prior`` divided by the mean of its positive entries; ``guided`` if no iteration is by residual.
         state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second, ….
         world_sigma: the caller's standard deviation of each point, 0 where unknown.
         votes: see :class:`~kornia_pnpnet.judge.evidence.Votes`.
-        hyperparameters: step, damping and shape of the kernel of each iteration, scalars.
+        hyperparameters: for each iteration, the scalars step, damping and shape of the kernel.
         starts: number :math:`S` of initial states of each problem.
     """
 
@@ -111,7 +111,7 @@ class Refinement(NamedTuple):
     Attributes:
         state: the refined pose in the frame of the problem, and the refined camera.
         weights: the weight of each pair at the refined pose, shape :math:`(B, N)`.
-        cost: robust loss of pairs and terms, divided by the number of pairs, shape :math:`(B,)`.
+        cost: robust loss of the pairs and the priors, divided by the number of pairs, shape :math:`(B,)`.
         ok: whether the pose is believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs of positive weight are in front of the camera, bool, shape :math:`(B,)`.
         probability: see :func:`~kornia_pnpnet.judge.evidence.probability`, shape :math:`(B,)`.
@@ -143,7 +143,7 @@ class RobustWeightedLM(Configured):
     equations cannot be solved keeps its pose, and is not ``ok``.
 
     *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
-    pixel, or whitened by its covariance, at the previous estimate. The scale of a kernel is in standard deviations.
+    pixel, or whitened by its covariance, at the previous estimate. Scales of kernels are then in standard deviations.
 
     *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser. The kernel of
     the last of these iterations then gives the cost of each pose. All other iterations refine the pose of lowest cost.
@@ -161,8 +161,8 @@ class RobustWeightedLM(Configured):
             squares.
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
-        reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10, except in
-            the last ``by_residual`` iterations. Without rejection, iterations from a distant start can diverge.
+        reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. The last
+            ``by_residual`` iterations never reject. Without rejection, iterations from a distant start can diverge.
         by_residual: number of final iterations that ignore the initialiser's weights, at most the number of iterations
             after the choice among several poses.
         learnable: whether the hyperparameters are trained.
@@ -354,7 +354,7 @@ class RobustWeightedLM(Configured):
         return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
-        """Fit a mixture of inliers and outliers to the residuals, and set estimated noise of points to 0 if better."""
+        """Fit a mixture of inliers and outliers to the residuals. Estimated noise of points becomes 0 if likelier."""
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
@@ -368,7 +368,7 @@ class RobustWeightedLM(Configured):
         other = (second > first + _EXPECTED).long()
         index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
         noise, mixture = taken((both, found.mixture), index)
-        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # strides as after an iteration, to share its graph
+        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # strides as after an iteration: both share one graph
         return plan._replace(problem=plan.problem._replace(noise=noise)), now._replace(mixture=mixture)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
@@ -410,7 +410,7 @@ class RobustWeightedLM(Configured):
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
-        """Keep the state of each problem with the lowest cost. ``rivals`` are the problems of all states in ``now``."""
+        """For each problem, keep the state of lowest cost. ``rivals`` are the problems of all states in ``now``."""
         batch = prior.shape[0]
         projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
@@ -421,7 +421,7 @@ class RobustWeightedLM(Configured):
     def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
         """Robust loss of pairs and terms, divided by the number of pairs that have a weight, shape (B,)."""
         sq_residual, precision = information(projection, problem)
-        # The bound in square pixels times the mean precision of both coordinates is the bound in variances.
+        # The bound in square pixels, times the mean precision of both coordinates, is the bound in variances.
         most = (_MAX_RESIDUAL * projection.focal).square().reshape(-1, 1)
         most = most * (precision if isinstance(precision, Tensor) else 0.5 * (precision.uu + precision.vv))
         sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
@@ -479,7 +479,7 @@ def taken(tree: _T, index: Tensor) -> _T:
 
 
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """The noise of every pair: sigmas of the initialiser, else of the caller, and the caller's covariances.
+    """The noise of every pair: its sigmas are the initialiser's, or else the caller's; covariances are the caller's.
 
     If the initialiser gave no noise, unknown sigmas become 0. Without any noise, the result is ``None``.
     """

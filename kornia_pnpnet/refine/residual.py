@@ -110,7 +110,7 @@ class NormalEquations(NamedTuple):
 
 
 def project(state: State, problem: Problem) -> Projection:
-    """Project the points of a problem, and subtract their pixels: the residual is :math:`f d (p, q) - b`.
+    """Project the points of a problem, and subtract their pixels :math:`b`: the residual is :math:`f d (p, q) - b`.
 
     The depth of points behind the camera is replaced before the division, so that values and gradients are finite.
 
@@ -249,8 +249,8 @@ def normal_equations(
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
     """The rows of the Jacobian for u and v, times z/f, shape (6 + K, 2, N, B).
 
-    A row is y × e for the rotation and e for the translation, where y = R x, and e is z times the derivative of p or q
-    by a point in the frame of the pose. For one camera the rows e are (1, 0, -p) and (0, 1, -q).
+    A row is y × e for the rotation, and e for the translation. Here y = R x, and e is z times the derivative of p or q
+    by the point in the frame of the pose. For one camera, the vectors e are (1, 0, -p) and (0, 1, -q).
     """
     plane = projection.plane
     if problem.rig is None:

@@ -47,8 +47,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
         world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`; :math:`B` stands
             for any number of leading dimensions, also for none.
         cam_down: measured direction of gravity in the camera's axes (+z forward), of the same shape as ``world_down``.
-        sigma: standard deviation of the measured direction about each perpendicular axis in radians, a number or
-            :math:`(B,)`.
+        sigma: standard deviation of the measured direction in radians, about each axis that is perpendicular to it, a
+            number or :math:`(B,)`.
 
     Raises:
         BaseError: when the directions are not :math:`(B, 3)`, or sigma is neither a positive number nor a tensor with
@@ -115,7 +115,7 @@ class CameraTerm(NamedTuple):
         return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
 
     def linearise(self, state: State) -> Linear:
-        """The residual is log f minus its expected value, then the coefficients of distortion."""
+        """The residual holds log f minus its expected value, followed by the coefficients of radial distortion."""
         assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
@@ -183,7 +183,7 @@ class PoseTerm(NamedTuple):
         return cls(pose, information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank), usable
 
     def errors(self, pose: Pose) -> tuple[Tensor, Tensor]:
-        """The tangent vector of ``retract`` from poses to the prior's pose, (B, 6), and its squared Mahalanobis length.
+        """The tangent vector (B, 6) by which ``retract`` moves poses to the prior, and its squared Mahalanobis length.
 
         The vector contains no rotation about ``free``.
         """
@@ -255,8 +255,8 @@ def _open_axis(information: Tensor) -> Tensor:
 def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
     """Ascending eigenvalues (B, 6) after scaling to a unit diagonal, and whether each matrix is symmetric, (B,).
 
-    An entry 0 of the diagonal takes the scale of the largest entry with the same unit, so that rounding errors in its
-    row stay small. If all these entries are 0, their rows must be 0.
+    A diagonal entry of 0 takes the scale of the largest diagonal entry with the same unit, so that rounding errors in
+    its row stay small. If all diagonal entries with this unit are 0, their rows must be 0.
     """
     information = information.detach().double()
     diagonal = information.diagonal(dim1=1, dim2=2)

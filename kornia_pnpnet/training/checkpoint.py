@@ -21,7 +21,7 @@ CHECKPOINT_NAME, HISTORY_NAME = "last.ckpt", "history.csv"
 
 
 class TrainingError(RuntimeError):
-    """A training cannot go on, or a stopped training cannot be continued. The message names the reason."""
+    """A training run cannot go on, or a stopped run cannot be continued. The message names the reason."""
 
 
 @contextmanager
@@ -44,7 +44,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
 
 
 class StageClock:
-    """Wall-clock ``seconds`` of each stage of a loop. GPU work counts in the stage that waits for the GPU."""
+    """Wall-clock ``seconds`` of each stage of a loop. GPU work counts towards the stage that waits for the GPU."""
 
     def __init__(self, *stages: str) -> None:
         self.seconds = dict.fromkeys(stages, 0.0)
@@ -90,14 +90,14 @@ class History:
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Raise ``TrainingError`` when the file is damaged or has another identity. Its setting ``updates`` may be smaller.
+    Raise ``TrainingError`` if the file is damaged or its identity differs. The file's ``updates`` may be smaller.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         settings = dict(state["identity"]["settings"])
         settings["updates"] = max(settings["updates"], identity["settings"]["updates"])  # a run may become longer
         found = differences({**state["identity"], "settings": settings}, identity)
-    except Exception as error:  # torch.load raises many types on a damaged file
+    except Exception as error:  # torch.load raises many types of errors on a damaged file
         raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error
     if found:
         raise TrainingError(f"The checkpoint {path} is of another run: {'; '.join(found)}.")

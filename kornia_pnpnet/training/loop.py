@@ -1,7 +1,7 @@
 """The training loop on one process or several. Lightning Fabric handles devices and processes.
 
-The loop raises the weight of the refined loss terms from 0 to 1, and skips steps whose loss or gradient is not finite.
-A run that is stopped and continued gives the same numbers as a run without a stop.
+The loop raises the weight of the loss terms of refined poses from 0 to 1, and skips steps whose loss or gradient is not
+finite. A run that is stopped and continued gives the same numbers as a run without a stop.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ class TrainSettings:
         lr: Adam's learning rate for the network.
         lr_refine: Adam's learning rate for the hyperparameters of the refinement.
         warmup: number of updates over which the learning rates rise linearly.
-        final_lr: factor of the learning rates at the end of the cosine decay; 1 means no decay.
+        final_lr: factor that multiplies the learning rates at the end of the cosine decay. 1 means no decay.
         clip: largest norm of a gradient. Longer gradients are scaled to this norm; infinity means no clipping.
-        ramp: start and end of the ramp, as shares of the run. During the ramp, the weight of the refined loss terms
-            rises linearly from 0 to 1.
+        ramp: start and end of the ramp, as shares of the run. During the ramp, the weight of the loss terms of refined
+            poses rises linearly from 0 to 1.
         max_skipped: largest number of skipped steps. A larger number ends the run with an error.
         log_every: number of updates between rows of the learning curves.
         validate_every: number of updates between validations.
@@ -144,10 +144,10 @@ def fit(
         model: the solver, trained in place.
         data: source of the problems. Batch ``i`` is the batch of update ``i + 1``.
         validation: problems of the validation sets, by the name of the set.
-        loss: loss of results against true poses.
+        loss: loss that compares results with true poses.
         settings: numerical settings of the run.
         folder: folder of the run.
-        fabric: a launched Fabric; one process on the CPU when ``None``.
+        fabric: a launched Fabric. ``None`` means one process on the CPU.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
             only with an equal ``identity`` and equal settings, except that ``settings.updates`` may grow. The learning
             rates and the ramp then follow the schedule of the longer run.
@@ -190,7 +190,7 @@ def fit(
     optimizer = torch.optim.Adam(groups, fused=True)
     solver, fabric_optimizer = fabric.setup(model, optimizer)
     solver.mark_forward_method("with_starts")
-    if state is not None:  # after `setup`, so that Adam's state is on the device of the parameters
+    if state is not None:  # loaded after `setup`, so that Adam's state is on the device of the parameters
         optimizer.load_state_dict(state["optimizer"])
     model.train()
 
@@ -198,7 +198,7 @@ def fit(
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
     part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
-    # Updates with the refinement are much slower, so each phase has a bar and a speed of its own.
+    # Updates with refinement are much slower than updates before. Each of these phases has its own bar and speed.
     alone = min(settings.updates, math.ceil(settings.ramp[0] * settings.updates))
     phase = ("network alone", alone) if start < alone else (_REFINES, settings.updates)
     bar = tqdm(None, *phase, initial=start, disable=not progress or history is None, unit="update", smoothing=0.0)

@@ -52,8 +52,9 @@ class FitReport:
         interrupted: whether a signal ended the call early. A checkpoint is then saved.
         seconds: wall-clock time of this call.
         updates_per_second: average speed of this call.
-        time_shares: share of ``seconds`` by stage: data (waiting), forward, backward, optimizer and rest.
-        peak_memory_mib: peak resident memory of this process, 0 on Windows; on a GPU, the peak that PyTorch allocated.
+        time_shares: share of ``seconds`` for each stage: data (waiting for it), forward, backward, optimizer and rest.
+        peak_memory_mib: on a GPU, the peak memory that PyTorch allocated. Otherwise the peak resident memory of this
+            process, which is 0 on Windows.
     """
 
     start: Count
@@ -112,10 +113,10 @@ class RunResults:
     """Results of a training run.
 
     Attributes:
-        overrides: arguments of ``train.py``, ``key=value``.
+        overrides: arguments of ``train.py`` in the form ``key=value``.
         run: the report of the training.
         us_per_problem: time of the solver in microseconds per problem, in calls of at most 1000 problems.
-        validation: success and errors by the name of the validation set; at least one set.
+        validation: success and errors on each validation set, by the name of the set. At least one set is needed.
         learned: learned hyperparameters of the refinement.
         model: configuration of the solver.
         config: resolved configuration of ``train.py``.
@@ -212,7 +213,7 @@ def load_run(path: str | Path) -> RunResults:
 
 
 def find_results(weights: str | Path) -> RunResults | None:
-    """Load the results of the run that trained some weights; ``None`` if there is no results file.
+    """Load the results of the run that trained some weights, or return ``None`` if there is no results file.
 
     The file is in the folder of the weights, or in the parent folder if the folder has the name ``weights``. For the
     argument and the errors see :func:`~kornia_pnpnet.pretrained.find_weights` and :func:`load_run`.

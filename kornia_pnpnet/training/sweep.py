@@ -12,7 +12,7 @@ from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.training.card import HOW_IT_RAN
 
-# Overrides precede this column of a summary.
+# In a summary, the columns of the overrides precede this column.
 _FIRST_RESULT = "update"
 
 
