@@ -30,7 +30,7 @@ __all__ = ["checked_inputs", "given_cameras", "in_parts", "restore_leading"]
 
 _T = TypeVar("_T")
 
-# When `in_parts` removes padding, a problem keeps at least this number of pairs, padding included.
+# When `in_parts` removes padding, each problem keeps at least this number of rows. Some of them can be padding.
 _LEAST_PAIRS = 16
 
 

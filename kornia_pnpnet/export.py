@@ -106,8 +106,8 @@ def export_program(
 
     Args:
         solver: a solver whose initialiser is not RANSAC. The program always uses ``effort="fixed"``.
-        n: number of pairs per problem. ``None``: the number that the network was built for, or any number of at least 4
-            if the network accepts any number.
+        n: number of pairs per problem. ``None``: the number that the network was built for. If the network was built
+            for no particular number, the exported solver accepts every number from 4.
         batch: number of problems in each call. A compiler can optimise for a fixed number. ``None``: any number.
         rig: whether the program solves problems of rigs (several cameras with one pose).
 

@@ -24,7 +24,7 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 
-# Solvers of other libraries, for type checkers.
+# Names of the solvers of other libraries. Only type checkers use this type.
 _Peer: TypeAlias = Literal[
     "opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap"
 ]

@@ -67,8 +67,8 @@ class SyntheticProblems(RandomProblems):
         seed: seed of the stream.
         points: prior of the points in the camera's frame. ``None`` means ``BoxPoints()``.
         outliers: number and kinds of outliers. ``None`` means no outliers.
-        translation_sigma: standard deviation of each coordinate of normal translations. With ``None``, translations are
-            uniform in a cube of side 25 about 0.
+        translation_sigma: standard deviation of each coordinate of normally distributed translations. With
+            ``None``, translations are uniform in a cube of side 25 about 0.
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels. The principal point is the pixel (0, 0).
         half_image: half the side, in pixels, of the image, which is a square about 0. The pixels of *sensing* outliers

@@ -12,8 +12,8 @@ determinant of the rays. Then the conic is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3.
 
-One root of this cubic gives two lines. Each line intersects a conic with other weights in two points. A Newton step
-then refines the ratios.
+One root of this cubic gives two lines. Each line intersects the conic of other weights :math:`u` in two points. A Newton
+step then refines the ratios.
 
 The last dimension of every tensor is a chunk of C problems. Finite values are selected by ``lerp`` with a weight of 0
 or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
@@ -229,8 +229,8 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """For triangles given by a base and another side, both (3, *, C), compute lengths and directions.
 
-    Returns unit vectors along the base and along the height, 1 divided by the length of the base, the component of the
-    side along the base, and the squared height.
+    Returns five values: the unit vector along the base; the unit vector along the height; the inverse of the base's
+    length; the component of the side along the base; the squared height.
     """
     tiny = torch.finfo(base.dtype).tiny
     inv_base = _dot(base, base).clamp_(min=tiny).rsqrt_()

@@ -33,7 +33,7 @@ def kept_at_once(count: int, like: Tensor) -> int:
 
 @torch.no_grad()
 def spread_evenly(present: Tensor, count: int) -> Tensor:
-    """Positions (B, count) of present pairs, evenly spread. If fewer than ``count`` are present, absent pairs follow.
+    """Indices (B, count) of present pairs, evenly spread. If fewer than ``count`` are present, absent pairs follow.
 
     Multiples of the golden ratio shift the positions slightly, so that the selection does not follow a periodic pattern
     in the order of the pairs. No position occurs twice, unless the problem has fewer than ``count`` pairs.
@@ -138,7 +138,7 @@ class Samples:
         self._upper = self._share.gather(1, self._order).cumsum(-1)
 
     def positions(self, problems: Tensor, start: int, stop: int) -> Tensor:
-        """Positions (P, H, s) of pairs in samples ``start`` to ``stop - 1``. After the last sample, samples repeat."""
+        """Indices (P, H, s) of pairs in samples ``start`` to ``stop - 1``. After the last sample, samples repeat."""
         listed = torch.arange(start, stop, device=problems.device) % self.totals[problems, None]
         ranks = self._tables[self._kinds[problems, None], listed.clamp(max=self._tables.shape[1] - 1)]
         if self._numbers is not None:
@@ -157,7 +157,7 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Positions (P, count) of the pairs at evenly spaced values of their cumulative chances."""
+        """Indices (P, count) of the pairs at evenly spaced values of their cumulative chances."""
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
         return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))

@@ -231,7 +231,7 @@ class RobustWeightedLM(Configured):
         return step, damping, shape
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
-        """Copy the module with ``m`` iterations. Further iterations repeat the hyperparameters of the last iteration.
+        """Return a copy of ``m`` iterations. Further iterations repeat the hyperparameters of the last iteration.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
