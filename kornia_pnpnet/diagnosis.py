@@ -128,7 +128,7 @@ def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[T
 
 
 def _changed(world: Tensor, pixels: Tensor, cameras: Tensor) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-    """Points (B, N, 3), pixels (B, N, 2) and cameras (B, 3, 3) after each change that does not concern the pose."""
+    """Points (B, N, 3), pixels (B, N, 2) and cameras (B, 3, 3) after each change of the inputs."""
     centre, upright = cameras[:, None, :2, 2], pixels.new_tensor([1.0, -1.0])
 
     def camera(focal: float, principal: float) -> Tensor:

@@ -400,8 +400,8 @@ class PnPNet(PretrainedMixin):
     def _result(self, focal: Tensor, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
         """Express the refined state in the caller's world."""
         pose, first = frame.undo(refined.pose), frame.undo(starts.pose)
-        # A sum is finite only if all its terms are finite. The rotation needs no test, because its products with the
-        # centroid are terms of the translation.
+        # A sum is finite only if all its terms are finite. The translation has the product of rotation and centroid as
+        # a term, so the rotation needs no test of its own.
         valid = frame.valid
         finite = valid & (pose.translation.sum(-1) + refined.weights.sum(-1) + refined.cost).isfinite()
         ok = finite & refined.ok if starts.ok is None else finite & refined.ok & starts.ok

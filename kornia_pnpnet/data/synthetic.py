@@ -81,9 +81,9 @@ class SyntheticProblems(RandomProblems):
             ``10 * img_sigma`` are outliers.
         sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. With a spread
             above 0, the sigmas of a batch have the shape ``(batch_size, n)``.
-        axis_ratio: ratio of the largest to the smallest standard deviation over the random axes of a pair's noise, at
-            most 100. If it is above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the axes, known
-            noise is given as covariances, and ``known_noise`` must be 0 or 1.
+        axis_ratio: the noise of a pair has random axes. This is the largest standard deviation along an axis divided by
+            the smallest, at most 100. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the axes,
+            known noise is given as covariances, and ``known_noise`` must be 0 or 1.
         known_noise: share of the problems that come with both sigmas. With 0, batches have no sigmas. Above 0, a third
             of the other problems come with one of the two sigmas, and each missing sigma is NaN.
         confidence_share: share of the problems that have confidences. The confidences of other problems are NaN. With

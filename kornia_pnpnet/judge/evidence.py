@@ -86,8 +86,8 @@ _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
 # Largest `pose_sigma` of a pose that is believed. The unit of `pose_sigma` is the largest error of a correct pose.
 _OPEN = 0.5
-# Largest standard deviation of plausible noise in radians. With 0.0125, 4 % of correct poses of indoor RGB-D matches
-# (`rgbd/indoor.npz`, without a ratio test) would not be believed.
+# Largest standard deviation of plausible noise in radians. The value 0.0125 would reject 4 % of the correct poses of
+# indoor RGB-D matches (`rgbd/indoor.npz`, without a ratio test).
 _MOST_NOISE = 0.016
 # A point lies off a line if its distance from it exceeds this factor times the standard deviation along the line.
 _OFF = 0.05

@@ -26,7 +26,7 @@ _SEEN = 0.25
 # Inlier threshold for rigs, in focal lengths.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
-# Number of samples that RANSAC solves with a fixed effort, and number of pairs that score each pose.
+# If the effort is fixed: number of samples that RANSAC solves, and number of pairs that score each pose.
 _SAMPLES, _JUDGES = 128, 32
 # The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, 2018).
 _ROOT = 1.2207440846057596

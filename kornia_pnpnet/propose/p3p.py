@@ -12,8 +12,8 @@ determinant of the rays. Then the conic is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3.
 
-One root of this cubic gives two lines. Each line intersects the conic of other weights :math:`u` in two points. A Newton
-step then refines the ratios.
+One root of this cubic gives two lines. Each line intersects the conic of other weights in two points. A Newton step
+then refines the ratios.
 
 The last dimension of every tensor is a chunk of C problems. Finite values are selected by ``lerp`` with a weight of 0
 or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.

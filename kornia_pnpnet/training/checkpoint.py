@@ -66,7 +66,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, An
 
 
 class History:
-    """Learning curves in a CSV file and TensorBoard. Rows of an earlier call are kept up to the update ``start``."""
+    """Learning curves in a CSV file and TensorBoard. Rows of earlier calls stay if ``update <= start``."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
         self._path, self._columns = folder / HISTORY_NAME, columns
