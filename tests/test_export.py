@@ -15,6 +15,7 @@ from kornia.core.exceptions import BaseError, ShapeError, ValueCheckError
 
 from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, SetInit, create_solver
 from kornia_pnpnet.cli import main
+from kornia_pnpnet.core.performance import INLINE
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.export import OUTPUTS, RIG_INPUTS, export_onnx, export_package, export_program, load_package
 
@@ -228,3 +229,14 @@ def test_files_that_are_no_packages(tmp_path):
     path.write_text("text")
     with pytest.raises(ValueCheckError, match="text"):
         load_package(path)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")  # of PyTorch, about its own code
+def test_a_package_of_one_problem_calls_no_operator_of_pytorch():
+    """One call of PyTorch moves all tensors of the graph from the stack to the heap, which takes ten times as long."""
+    program = export_program(create_solver("pnpnet-n9"), 9, batch=1).run_decompositions(INLINE)
+    called = {node.target.overloadpacket for node in program.graph.nodes if node.op == "call_function"}
+    aten = torch.ops.aten
+    assert aten.scatter_add in called  # Inductor generates code for it
+    calls = aten.mm, aten.bmm, aten.addmm, aten.baddbmm, aten.matmul, aten.linear, aten.sort, aten.argsort, aten.topk
+    assert not called & {*calls, aten.cumsum, aten.cumprod, aten._linalg_eigh}

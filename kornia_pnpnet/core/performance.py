@@ -395,10 +395,15 @@ def _sort(x: Tensor, dim: int = -1, descending: bool = False, *, stable: bool | 
     return _topk(x, x.shape[dim], dim, descending)
 
 
+def _argsort(x: Tensor, dim: int = -1, descending: bool = False) -> Any:
+    return NotImplemented if x.shape[dim] > _FEW_INLINE else _sort(x, dim, descending)[1]
+
+
 _aten = torch.ops.aten
 #: Decompositions for ``ExportedProgram.run_decompositions`` of a graph with static sizes.
 INLINE: dict[Any, Callable[..., Any]] = {
-    _aten.addmm.default: _addmm,
+    **dict.fromkeys((_aten.addmm.default, _aten.baddbmm.default), _addmm),
+    _aten.argsort.default: _argsort,
     _aten.cumsum.default: _cumsum,
     _aten.linear.default: _linear,
     **dict.fromkeys((_aten.bmm.default, _aten.matmul.default, _aten.mm.default), _matmul),
