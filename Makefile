@@ -40,10 +40,8 @@ install: $(ALL) ## Make .venv with every extra
 demo: $(if $(DATA),$(ALL),$(DEMO)) ## Solve problems beside OpenCV and PoseLib; DATA=folder solves a COLMAP scene
 	$(VENV)/bin/pnpnet demo $(if $(DATA),--data '$(DATA)')
 
-bench: $(ALL) ## Time and memory beside other libraries; writes benchmarks/*.json and docs/performance.md
-	$(PY) benchmarks/solvers.py --repeats 5 --out benchmarks/solvers.json
-	$(PY) benchmarks/performance.py measure
-	$(PY) benchmarks/performance.py render
+bench: $(ALL) ## Measure all results and write their pages: hours; continues where it was stopped (benchmarks/measure.sh)
+	DATA='$(DATA)' PYTHON='$(PY)' sh benchmarks/measure.sh
 
 # One thread per worker: two workers on two cores would otherwise fight over them.
 test: lint ## Lint, types and the quick tests

@@ -3,6 +3,9 @@
 import importlib
 import itertools
 import json
+import os
+import shutil
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -29,6 +32,41 @@ def script(request):
     for module in ("cv2", "poselib", "pycolmap"):
         pytest.importorskip(module)
     return importlib.import_module(request.param)
+
+
+# -- measure.sh --------------------------------------------------------------------------------------------------------
+
+
+def test_everything_is_measured_once_at_a_commit(tmp_path):
+    (tmp_path / "benchmarks").mkdir()
+    shutil.copy(FOLDER / "measure.sh", tmp_path / "benchmarks")
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\necho "$*" >> calls\ncase "$*" in *"$BROKEN"*) exit 1;; esac\n')
+    python.chmod(0o755)
+    git = ["git", "-c", "user.name=n", "-c", "user.email=e", "-C", str(tmp_path)]
+
+    def commit() -> None:
+        subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "m"], check=True)
+
+    def scripts(broken: str) -> list[str]:
+        (tmp_path / "calls").write_text("")
+        environment = {**os.environ, "PYTHON": str(python), "DATA": "scenes", "BROKEN": broken}
+        done = subprocess.run(["sh", str(tmp_path / "benchmarks/measure.sh")], env=environment, check=False)
+        assert (done.returncode == 0) == (broken == "nothing")
+        return [line.split()[0] for line in (tmp_path / "calls").read_text().splitlines()]
+
+    subprocess.run([*git, "init", "-q"], check=True)
+    commit()
+    pages = ["benchmarks/performance.py", "docs/results/make.py"]
+    stopped = scripts("cameras.py")
+    assert stopped[0] == "benchmarks/solvers.py"
+    assert stopped[-1] == "benchmarks/cameras.py"
+    rest = scripts("nothing")
+    assert rest[0] == stopped[-1]
+    assert rest[-3:] == ["docs/results/make.py", *pages]
+    assert scripts("nothing") == pages
+    commit()
+    assert scripts("nothing") == stopped + rest[1:]
 
 
 # -- solvers.py --------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def environment() -> dict[str, Any]:
     Returns:
         ``versions`` by package (``None`` if not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
         ``gpu`` (``None`` without a GPU), ``date`` in UTC, ``behaviour`` (``BEHAVIOUR``), and the git ``commit`` of the
-        package (``None`` outside a checkout). The commit ends with ``+`` if tracked files have changes.
+        package (``None`` outside a checkout). The commit ends with ``+`` if tracked Python files have changes.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},
@@ -70,7 +70,10 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     root = Path(__file__).resolve().parents[2]
     if (root / ".git").exists():
-        git = ["git", "-C", str(root), "describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
+        git = ["git", "-C", str(root)]
         with suppress(OSError, subprocess.SubprocessError):
-            return subprocess.check_output(git, text=True, stderr=subprocess.DEVNULL, timeout=10).strip()
+            quiet: dict[str, Any] = {"stderr": subprocess.DEVNULL, "timeout": 10}
+            head = subprocess.check_output([*git, "rev-parse", "HEAD"], text=True, **quiet)
+            changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "*.py"], check=False, **quiet).returncode
+            return head.strip() + "+" * bool(changed)
     return None
