@@ -79,6 +79,7 @@ def test_cost_of_an_operation(function, expected):
     [
         (lambda a, b: a @ b, [(5, 6, 2, 3), (6, 3, 4)], 30 * matmul(2, 3, 4)),
         (torch.nn.functional.linear, [(5, 3), (4, 3), (4,)], 5 * flops(multiply=12, add=12)),
+        (torch.cdist, [(5, 2, 3), (5, 4, 3)], 40 * flops(add=3 + 2, multiply=3, sqrt=1)),
         (torch.linalg.inv_ex, [(5, 4, 4)], 5 * solve(4, 4)),
         (torch.linalg.cholesky_ex, [(5, 4, 4)], 5 * cholesky(4)),
     ],
@@ -155,10 +156,10 @@ def test_ransac_draws_more_samples_with_more_outliers_and_more_confidence():
 
 
 def test_results_are_plain_data_with_a_count_for_each_n():
-    sizes, names = [6, 9], ["net", "epnp", "p3p-ransac", "ransac-epnp-lm"]
+    sizes, names = [6, 9, 12], ["net", "epnp", "p3p-ransac", "ransac-epnp-lm"]
     results = complexity_results(names, sizes)
     assert json.loads(json.dumps(results, allow_nan=False)) == results
-    assert (results["n"], results["outliers"], results["ransac"]) == (sizes, [2, 3], names[2:])
+    assert (results["n"], results["outliers"], results["ransac"]) == (sizes, [2, 3, 4], names[2:])
     counts = results["counts"]
     assert [name for name in names if None in counts[name]] == ["ransac-epnp-lm"]  # its samples have 7 pairs
     assert counts["net"][1] == operation_count("net-n9", 9) == operation_count("net", 9)

@@ -175,6 +175,9 @@ def _operations(name: str, call: dict[str, Any], output: Any) -> float:
     entries = tensors[0].numel() if tensors else 0
     if name == "mean":
         return (entries - results) * ADD + results * DIVIDE
+    if name == "_cdist_forward":
+        length = tensors[0].shape[-1]
+        return results * ((2 * length - 1) * ADD + length * MULTIPLY + SQRT)
     if name in _MATRIX:
         return math.prod(tensors[0].shape[:-2]) * _MATRIX[name](*(tensor.shape[-2:] for tensor in tensors))
     if name in _REDUCTIONS:
