@@ -290,7 +290,8 @@ def measure_times(solver: nn.Module) -> list[dict[str, Any]]:
 def page(results: harness.Row) -> str:
     """The page of the results."""
     answers = ("covariances", "sigmas", "nothing", *PEERS)
-    facts = {"batch": BATCH, "gravity": GRAVITY, "turn": TURN, "shift": SHIFT, "wrong": WRONG}
+    losses = sum(row["PoseLib"][0] < row["nothing"][0] for row in results["rows"] if "PoseLib" in row)
+    facts = {"losses": losses, "batch": BATCH, "gravity": GRAVITY, "turn": TURN, "shift": SHIFT, "wrong": WRONG}
     return harness.render("uncertainty.md.jinja", results=results, answers=answers, **facts)
 
 
