@@ -28,6 +28,7 @@ def make_source(kind=SyntheticProblems, **options):
     return kind(n=6, batch_size=5, seed=3, outliers=OutlierMix(), known_noise=0.5, img_sigma=(0.5, 5.0), **options)
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")  # on a machine with one core
 @pytest.mark.parametrize(
     ("workers", "source"),
     [
