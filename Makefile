@@ -41,7 +41,7 @@ demo: $(if $(DATA),$(ALL),$(DEMO)) ## Solve problems beside OpenCV and PoseLib; 
 	$(VENV)/bin/pnpnet demo $(if $(DATA),--data '$(DATA)')
 
 bench: $(ALL) ## Measure all results and write their pages: hours; continues where it was stopped (benchmarks/measure.sh)
-	DATA='$(DATA)' PYTHON='$(PY)' sh benchmarks/measure.sh
+	PYTHON='$(PY)' sh benchmarks/measure.sh
 
 # One thread per worker: two workers on two cores would otherwise fight over them.
 test: lint ## Lint, types and the quick tests

@@ -17,6 +17,8 @@ import torch
 #: so that a test can find results files that are too old. Files without a number were measured before the first change.
 BEHAVIOUR = 1
 
+# What decides results: written results do not count as changes of a checkout.
+_MEASURED = ("*.py", "kornia_pnpnet", "conf")
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
 # Distributions of OpenCV on PyPI, the most common distribution first.
 _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
@@ -28,7 +30,8 @@ def environment() -> dict[str, Any]:
     Returns:
         ``versions`` by package (``None`` if not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
         ``gpu`` (``None`` without a GPU), ``date`` in UTC, ``behaviour`` (``BEHAVIOUR``), and the git ``commit`` of the
-        package (``None`` outside a checkout). The commit ends with ``+`` if tracked Python files have changes.
+        package (``None`` outside a checkout). The commit ends with ``+`` if Python files, weights or
+        configurations have changes.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},
@@ -72,8 +75,8 @@ def _commit() -> str | None:
     if (root / ".git").exists():
         git = ["git", "-C", str(root)]
         with suppress(OSError, subprocess.SubprocessError):
-            quiet: dict[str, Any] = {"stderr": subprocess.DEVNULL, "timeout": 10}
-            head = subprocess.check_output([*git, "rev-parse", "HEAD"], text=True, **quiet)
-            changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "*.py"], check=False, **quiet).returncode
-            return head.strip() + "+" * bool(changed)
+            quiet: dict[str, Any] = {"text": True, "stderr": subprocess.DEVNULL, "timeout": 10}
+            head = subprocess.check_output([*git, "rev-parse", "HEAD"], **quiet).strip()
+            changed = subprocess.check_output([*git, "diff", "--name-only", "HEAD", "--", *_MEASURED], **quiet)
+            return head + "+" * bool(changed)
     return None

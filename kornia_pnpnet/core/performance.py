@@ -396,7 +396,7 @@ def _sort(x: Tensor, dim: int = -1, descending: bool = False, *, stable: bool | 
 
 
 def _argsort(x: Tensor, dim: int = -1, descending: bool = False) -> Any:
-    return NotImplemented if x.shape[dim] > _FEW_INLINE else _sort(x, dim, descending)[1]
+    return x.sort(dim, descending)[1]
 
 
 _aten = torch.ops.aten
