@@ -13,7 +13,7 @@ from kornia_pnpnet.arguments import checked_inputs
 from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
-from kornia_pnpnet.judge.evidence import Votes, at_pose, believe, evidence
+from kornia_pnpnet.judge.evidence import LEAST_PROBABILITY, Votes, at_pose, evidence, probability
 from kornia_pnpnet.problem import State
 from kornia_pnpnet.registry import create_solver
 from kornia_pnpnet.result import Pose
@@ -120,7 +120,7 @@ def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[T
     votes = Votes.of(problem, unknown)
     seen = at_pose(State.of(frame.apply(poses)), problem, votes)
     found = evidence(seen, problem, votes)
-    ok = frame.valid & believe(seen, problem, found, unknown)[1]
+    ok = frame.valid & (probability(seen, problem, found, unknown) >= LEAST_PROBABILITY)
     sigma = found.sigma * problem.focal / frame.img_scale
     columns = found.log_ratio / problem.weights.shape[1], found.inlier.gt(0.5).to(sigma).mean(1), sigma, ok.to(sigma)
     rows = torch.stack(columns, -1).unflatten(0, (len(names), -1)).median(1).values.tolist()

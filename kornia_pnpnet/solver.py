@@ -343,7 +343,7 @@ class PnPNet(PretrainedMixin):
         adapts = free and (self.effort == "adaptive" or (can_adapt and not self.training))
         compares = free and not self.training and not self._whole.compiled
         searches = adapts and self.focal == "known"  # an unknown focal length has another search
-        problem, frame, starts = self._run(self._propose, inputs, call, searches and inputs.confidence is None)
+        problem, frame, starts = self._run(self._propose, inputs, call, searches)
         rival = replaced = found = odds = None
         if searches:
             keep_others = inputs.init is not None or inputs.prior is not None

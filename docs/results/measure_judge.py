@@ -17,10 +17,10 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from kornia.geometry.linalg import transform_points
 from omegaconf import OmegaConf
-from sklearn.linear_model import LogisticRegression
 from torch import Tensor
+from torch.nn import functional
 
-from kornia_pnpnet import PnPNet, Pose
+from kornia_pnpnet import Pose
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import ObjectPoints, OutlierMix, SceneProblems, SyntheticProblems, load_scene
@@ -99,27 +99,26 @@ def kinds(seed: int) -> Iterator[Drawn]:
 
 
 def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
-    """Solve problems: the variables of the law, the probability, ``ok``, and which poses are near and right."""
+    """Solve problems: what the fit needs, the probability, ``ok``, and which poses are near and right."""
     solver, seen = load_solver(name), []
-    original = PnPNet._result
+    original = RobustWeightedLM.judge
 
-    def listen(self: PnPNet, focal: Tensor, frame: Any, starts: Any, refined: Any, call: Any) -> Any:
-        seen.append((refined.evidence.log_ratio, refined.sigma, refined.probability))
-        return original(self, focal, frame, starts, refined, call)
+    def listen(self: RobustWeightedLM, plan: Any, now: Any, found: Any = None, odds: Tensor | None = None) -> Any:
+        refined = original(self, plan, now, found, odds)
+        against_rivals = torch.ones_like(refined.probability) if odds is None else odds.sigmoid()
+        seen.append((refined.evidence.log_ratio, refined.probability > 0, against_rivals))
+        return refined
 
-    with mock.patch.object(PnPNet, "_result", listen):
+    with mock.patch.object(RobustWeightedLM, "judge", listen):
         result = solver(**kind.inputs)
-    log_ratio, sigma, probability = (torch.cat(x) for x in zip(*seen, strict=True))
+    log_ratio, usable, against_rivals = (torch.cat(x) for x in zip(*seen, strict=True))
     near = right = torch.zeros_like(result.ok)
     if kind.truth is not None:
         turn, shift = errors(result.pose, kind.truth)
         shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
-    variables = torch.stack(evidence.clipped(log_ratio, sigma), -1).double()
-    # A rival multiplies the probability of the law. The fit leaves out poses that fail a test, and poses with a rival.
-    alone = probability >= 0.99 * evidence.probability(log_ratio, sigma)
-    found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right}
-    return {**found, "variables": variables, "alone": alone & (probability > 0)}
+    found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right, "usable": usable}
+    return {**found, "evidence": log_ratio.clamp(*evidence.EVIDENCE_RANGE), "against_rivals": against_rivals}
 
 
 def errors(pose: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
@@ -135,14 +134,26 @@ def rates(row: dict[str, Tensor]) -> dict[str, Any]:
 
 
 def fit_law(rows: list[dict[str, Tensor]]) -> list[float]:
-    """Logistic regression of "near" on the two variables; every kind counts the same."""
-    chosen = [row["alone"] for row in rows]
-    variables, near = (
-        torch.cat([row[key][x] for row, x in zip(rows, chosen, strict=True)]) for key in ("variables", "near")
-    )
-    weight = torch.cat([torch.full((int(x.sum()),), 1.0 / len(x)) for x in chosen])
-    law = LogisticRegression(C=math.inf, tol=1e-8, max_iter=1000).fit(variables.numpy(), near.numpy(), weight.numpy())
-    return [float(f"{x:.4g}") for x in (*law.intercept_, *law.coef_[0])]
+    """Fit the law by maximum likelihood; every kind counts the same. Poses that fail a test are left out.
+
+    The probability of "near" is that of the law, multiplied by the probability that no rival is the right pose.
+    """
+    parts = [tuple(row[key][row["usable"]] for key in ("evidence", "against_rivals", "near")) for row in rows]
+    log_ratio, against_rivals, near = (torch.cat(x).double() for x in zip(*parts, strict=True))
+    weight = torch.cat([torch.full(x[0].shape, 1.0 / len(row["near"])) for x, row in zip(parts, rows, strict=True)])
+    law = torch.zeros(2, dtype=torch.double, requires_grad=True)
+    optimiser = torch.optim.LBFGS([law], max_iter=1000, tolerance_change=1e-12, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        probability = torch.sigmoid(law[0] + law[1] * log_ratio) * against_rivals
+        value = functional.binary_cross_entropy(probability, near, weight.double(), reduction="sum")
+        value.backward()
+        return value
+
+    with torch.enable_grad():
+        optimiser.step(loss)
+    return [float(f"{x:.4g}") for x in law.tolist()]
 
 
 _SYNTHETIC = ("matches, 9 pairs", "matches, 50 pairs", "uniform, 9 pairs")

@@ -13,7 +13,7 @@ unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1 or, with
 
 The mean of :math:`\exp L(s)` is weighted by the prior probability of :math:`s`. The *evidence* is the logarithm of this
 mean, minus the logarithm of the number of minimal samples, minus the logarithm of the number of poses per sample. A
-pose is *believed* if the evidence suffices and the inliers determine the pose accurately.
+pose is *believed* if its :func:`probability` suffices.
 
 The results have no gradient.
 """
@@ -34,6 +34,7 @@ from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, State
 from kornia_pnpnet.refine.residual import Projection, information, normal_equations, project
 
 __all__ = [
+    "EVIDENCE_RANGE",
     "FAR_TURN",
     "LAW",
     "LEAST_PROBABILITY",
@@ -42,8 +43,6 @@ __all__ = [
     "Mixture",
     "Votes",
     "at_pose",
-    "believe",
-    "clipped",
     "copies",
     "evidence",
     "pose_sigma",
@@ -76,12 +75,12 @@ _POSES = 4
 _KEY = math.pi / 4
 
 #: A pose is believed when its :func:`probability` is at least this value.
-LEAST_PROBABILITY = 0.9
-#: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
-#: logarithm of ``sigma``. ``python docs/results/make.py measure --only probability`` fitted these numbers.
-LAW = (-1.573, 0.6221, -0.4594)
-# Ranges to which the variables of `LAW`, the evidence and the logarithm of sigma, are clipped.
-_EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
+LEAST_PROBABILITY = 0.97
+#: Coefficients of the log-odds in :func:`probability`: the constant, and the factor of the evidence.
+#: ``python docs/results/make.py measure --only probability`` fitted these numbers.
+LAW = (0.8345, 0.8364)
+#: Range to which the evidence is clipped in :func:`probability`.
+EVIDENCE_RANGE = (-10.0, 15.0)
 #: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
 # Largest `pose_sigma` of a pose that is believed. The unit of `pose_sigma` is the largest error of a correct pose.
@@ -285,35 +284,21 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 
 
 @torch.no_grad()
-def believe(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The :func:`probability` of a pose, whether the pose is believed, bool, and its :func:`pose_sigma`, all (B,).
+def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> Tensor:
+    """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The probability must be at least `LEAST_PROBABILITY`, and :func:`pose_sigma` must be small. The points of the
-    inliers must span more than a line. The noise must be plausible, because pairs of a wrong convention, such as
-    mirrored pixels, have large residuals. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
+    The probability is a logistic function of the evidence. It is 0 if :func:`pose_sigma` is large, if the points of the
+    inliers lie on a line, or if the noise is implausible, because pairs of a wrong convention, such as mirrored pixels,
+    have large residuals. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
-    sigma = pose_sigma(seen.projection, problem, precision).detach()
     plausible = (found.sigma < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
-    usable = plausible & (sigma < _OPEN) & _leave_a_line(problem.world_points, found.inlier > 0.5)
-    chances = torch.where(usable, probability(found.log_ratio, sigma).to(problem.weights), 0.0)
-    return chances, usable & (chances >= LEAST_PROBABILITY), sigma
-
-
-def probability(log_ratio: Tensor, sigma: Tensor) -> Tensor:
-    """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
-
-    The probability is a logistic function of the evidence ``log_ratio`` and of log ``sigma`` (see :func:`pose_sigma`).
-    """
-    evidence, log_sigma = clipped(log_ratio, sigma)
-    offset, by_evidence, by_sigma = LAW
-    return torch.sigmoid(offset + by_evidence * evidence + by_sigma * log_sigma)
-
-
-def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Clip the two variables of :data:`LAW`, the evidence and the logarithm of sigma, to their ranges."""
-    return log_ratio.clamp(*_EVIDENCE), sigma.log().clamp(*_LOG_SIGMA).to(log_ratio.dtype)
+    usable = plausible & (pose_sigma(seen.projection, problem, precision) < _OPEN)
+    usable = usable & _leave_a_line(problem.world_points, found.inlier > 0.5)
+    offset, by_evidence = LAW
+    log_odds = offset + by_evidence * found.log_ratio.clamp(*EVIDENCE_RANGE)
+    return torch.where(usable, torch.sigmoid(log_odds), 0.0)
 
 
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:

@@ -20,8 +20,8 @@ from kornia_pnpnet.judge.evidence import (
     Mixture,
     Votes,
     at_pose,
-    believe,
     evidence,
+    probability,
     updated,
 )
 from kornia_pnpnet.problem import MIN_PAIRS, Noise, Problem, Starts, State
@@ -115,7 +115,6 @@ class Refinement(NamedTuple):
         ok: whether the pose is believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs of positive weight are in front of the camera, bool, shape :math:`(B,)`.
         probability: see :func:`~kornia_pnpnet.judge.evidence.probability`, shape :math:`(B,)`.
-        sigma: :func:`~kornia_pnpnet.judge.evidence.pose_sigma`, float64, shape :math:`(B,)`.
         evidence: the evidence for the pose.
     """
 
@@ -125,7 +124,6 @@ class Refinement(NamedTuple):
     ok: Tensor
     in_front: Tensor
     probability: Tensor
-    sigma: Tensor
     evidence: Evidence
 
     @property
@@ -251,7 +249,7 @@ class RobustWeightedLM(Configured):
         """Refine the poses of ``starts`` in the frame of the problem.
 
         A pose is ``ok`` only if the equations of the last iteration could be solved, at least three pairs are in
-        front of the camera, and the evidence suffices (:func:`~kornia_pnpnet.judge.evidence.believe`).
+        front of the camera, and its :func:`~kornia_pnpnet.judge.evidence.probability` suffices.
         """
         plan, now = self.iterate(self.begin(problem, starts))
         return self.judge(plan, now)
@@ -346,12 +344,12 @@ class RobustWeightedLM(Configured):
             robust = found.mixture.weights(seen)
         weights = torch.where(seen.projection.in_front, plan.prior * robust, 0.0)
         cost = self._cost(seen.projection, plan.problem, plan.prior, shape)
-        probability, ok, sigma = believe(seen, plan.problem, found, plan.votes.known)
+        chance = probability(seen, plan.problem, found, plan.votes.known)
         if odds is not None:
-            probability = probability * odds.sigmoid()
-            ok = ok & (probability >= LEAST_PROBABILITY)
+            chance = chance * odds.sigmoid()
         in_front = (seen.projection.in_front & (plan.prior > 0)).sum(-1) >= MIN_PAIRS
-        return Refinement(now.state, weights, cost, now.solved & ok & in_front, in_front, probability, sigma, found)
+        ok = now.solved & in_front & (chance >= LEAST_PROBABILITY)
+        return Refinement(now.state, weights, cost, ok, in_front, chance, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
         """Fit a mixture of inliers and outliers to the residuals. Estimated noise of points becomes 0 if likelier."""
