@@ -31,7 +31,7 @@ from kornia_pnpnet.propose import alternatives
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 
 #: The solvers of the fit, and other solvers that are only measured.
-FITTED, MEASURED = ("pnpnet-set", "p3p-ransac"), ("pnpnet-set:effort=fixed", "epnp-lm", "reppnp-lm")
+FITTED, MEASURED = ("pnpnet-set", "p3p-ransac", "pnpnet-set:effort=fixed"), ("epnp-lm", "reppnp-lm")
 #: Kinds of problems that the fit leaves out. A test of the noise or of the points decides about them.
 LEFT_OUT = ("y up", "left-handed", "row and column", "line", "3 pairs")
 PROBLEMS = 500
@@ -100,25 +100,33 @@ def kinds(seed: int) -> Iterator[Drawn]:
 
 def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
     """Solve problems: what the fit needs, the probability, ``ok``, and which poses are near and right."""
-    solver, seen = load_solver(name), []
-    original = RobustWeightedLM.judge
+    solver, sigmas, seen = load_solver(name), [], []
+    pose_sigma, judge = evidence.pose_sigma, RobustWeightedLM.judge
 
-    def listen(self: RobustWeightedLM, plan: Any, now: Any, found: Any = None, odds: Tensor | None = None) -> Any:
-        refined = original(self, plan, now, found, odds)
+    def watched_sigma(*arguments: Any) -> Tensor:
+        sigmas.append(pose_sigma(*arguments))
+        return sigmas[-1]
+
+    def watched_judge(
+        self: RobustWeightedLM, plan: Any, now: Any, found: Any = None, odds: Tensor | None = None
+    ) -> Any:
+        refined = judge(self, plan, now, found, odds)
         against_rivals = torch.ones_like(refined.probability) if odds is None else odds.sigmoid()
-        seen.append((refined.evidence.log_ratio, refined.probability > 0, against_rivals))
+        variables = torch.stack(evidence.clipped(refined.evidence.log_ratio, sigmas[-1]), -1)
+        seen.append((variables.double(), refined.probability > 0, against_rivals.double()))
         return refined
 
-    with mock.patch.object(RobustWeightedLM, "judge", listen):
+    patch = mock.patch.object
+    with patch(evidence, "pose_sigma", watched_sigma), patch(RobustWeightedLM, "judge", watched_judge):
         result = solver(**kind.inputs)
-    log_ratio, usable, against_rivals = (torch.cat(x) for x in zip(*seen, strict=True))
+    variables, usable, against_rivals = (torch.cat(x) for x in zip(*seen, strict=True))
     near = right = torch.zeros_like(result.ok)
     if kind.truth is not None:
         turn, shift = errors(result.pose, kind.truth)
         shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
     found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right, "usable": usable}
-    return {**found, "evidence": log_ratio.clamp(*evidence.EVIDENCE_RANGE), "against_rivals": against_rivals}
+    return {**found, "variables": variables, "against_rivals": against_rivals}
 
 
 def errors(pose: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
@@ -138,16 +146,16 @@ def fit_law(rows: list[dict[str, Tensor]]) -> list[float]:
 
     The probability of "near" is that of the law, multiplied by the probability that no rival is the right pose.
     """
-    parts = [tuple(row[key][row["usable"]] for key in ("evidence", "against_rivals", "near")) for row in rows]
-    log_ratio, against_rivals, near = (torch.cat(x).double() for x in zip(*parts, strict=True))
-    weight = torch.cat([torch.full(x[0].shape, 1.0 / len(row["near"])) for x, row in zip(parts, rows, strict=True)])
-    law = torch.zeros(2, dtype=torch.double, requires_grad=True)
+    parts = [tuple(row[key][row["usable"]] for key in ("variables", "against_rivals", "near")) for row in rows]
+    variables, against_rivals, near = (torch.cat(x) for x in zip(*parts, strict=True))
+    weight = torch.cat([torch.full(x[1].shape, 1.0 / len(row["near"])) for x, row in zip(parts, rows, strict=True)])
+    law = torch.zeros(3, dtype=torch.double, requires_grad=True)
     optimiser = torch.optim.LBFGS([law], max_iter=1000, tolerance_change=1e-12, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        probability = torch.sigmoid(law[0] + law[1] * log_ratio) * against_rivals
-        value = functional.binary_cross_entropy(probability, near, weight.double(), reduction="sum")
+        probability = torch.sigmoid(law[0] + variables @ law[1:]) * against_rivals
+        value = functional.binary_cross_entropy(probability, near.double(), weight.double(), reduction="sum")
         value.backward()
         return value
 

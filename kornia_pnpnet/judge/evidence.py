@@ -34,7 +34,6 @@ from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, State
 from kornia_pnpnet.refine.residual import Projection, information, normal_equations, project
 
 __all__ = [
-    "EVIDENCE_RANGE",
     "FAR_TURN",
     "LAW",
     "LEAST_PROBABILITY",
@@ -43,6 +42,7 @@ __all__ = [
     "Mixture",
     "Votes",
     "at_pose",
+    "clipped",
     "copies",
     "evidence",
     "pose_sigma",
@@ -75,12 +75,12 @@ _POSES = 4
 _KEY = math.pi / 4
 
 #: A pose is believed when its :func:`probability` is at least this value.
-LEAST_PROBABILITY = 0.97
-#: Coefficients of the log-odds in :func:`probability`: the constant, and the factor of the evidence.
-#: ``python docs/results/make.py measure --only probability`` fitted these numbers.
-LAW = (0.8345, 0.8364)
-#: Range to which the evidence is clipped in :func:`probability`.
-EVIDENCE_RANGE = (-10.0, 15.0)
+LEAST_PROBABILITY = 0.95
+#: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
+#: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.
+LAW = (-0.3902, 0.6246, -0.2504)
+# Ranges to which the variables of `LAW`, the evidence and the logarithm of `pose_sigma`, are clipped.
+_EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
 # Largest `pose_sigma` of a pose that is believed. The unit of `pose_sigma` is the largest error of a correct pose.
@@ -287,18 +287,23 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor) -> Tensor:
     """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The probability is a logistic function of the evidence. It is 0 if :func:`pose_sigma` is large, if the points of the
-    inliers lie on a line, or if the noise is implausible, because pairs of a wrong convention, such as mirrored pixels,
-    have large residuals. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
+    The probability is a logistic function of the evidence and of log :func:`pose_sigma`. It is 0 if ``pose_sigma`` is
+    large, if the points of the inliers lie on a line, or if the noise is implausible, because pairs of a wrong
+    convention, such as mirrored pixels, have large residuals. If ``known`` (B, 1), noise up to the caller's noise is
+    plausible, too.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
     plausible = (found.sigma < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
-    usable = plausible & (pose_sigma(seen.projection, problem, precision) < _OPEN)
-    usable = usable & _leave_a_line(problem.world_points, found.inlier > 0.5)
-    offset, by_evidence = LAW
-    log_odds = offset + by_evidence * found.log_ratio.clamp(*EVIDENCE_RANGE)
-    return torch.where(usable, torch.sigmoid(log_odds), 0.0)
+    sigma = pose_sigma(seen.projection, problem, precision).detach()
+    usable = plausible & (sigma < _OPEN) & _leave_a_line(problem.world_points, found.inlier > 0.5)
+    (offset, by_evidence, by_sigma), (log_ratio, log_sigma) = LAW, clipped(found.log_ratio, sigma)
+    return torch.where(usable, torch.sigmoid(offset + by_evidence * log_ratio + by_sigma * log_sigma), 0.0)
+
+
+def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """Clip the two variables of :data:`LAW`, the evidence and the logarithm of sigma, to their ranges."""
+    return log_ratio.clamp(*_EVIDENCE), sigma.log().clamp(*_LOG_SIGMA).to(log_ratio.dtype)
 
 
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
