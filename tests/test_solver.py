@@ -236,13 +236,6 @@ def test_a_given_matrix_becomes_the_nearest_rotation(kind, make_problems):
         assert_same(found.init, nearest, 1e-9, 1e-9)
 
 
-def test_a_given_matrix_has_the_gradient_of_the_nearest_rotation(make_problems):
-    p = make_problems(batch=2)
-    matrix = (1.02 * p.pose.rotation).requires_grad_()
-    first = lambda x: PnPNet(None)(*p[:3], init=Pose(x, p.pose.translation)).init.rotation  # noqa: E731
-    assert torch.autograd.gradcheck(first, matrix)
-
-
 @pytest.mark.parametrize("factor", [-1.0, 0.0, torch.nan])
 def test_a_given_matrix_that_is_no_rotation_is_ignored(factor, make_problems):
     p = make_problems()
