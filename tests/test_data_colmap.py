@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_helpers import CENTRE, FOCAL, HEIGHT, WIDTH, make_view, pose_of
+from data_helpers import CENTRE, FOCAL, HEIGHT, WIDTH, make_view, match_arrays, pose_of
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import damage, finite, many, names_the_file
@@ -51,20 +51,6 @@ def write_model(folder, model="SIMPLE_RADIAL", counts=COUNTS):
     for file, content in zip(FILES, contents, strict=True):
         (folder / file).write_text(content)
     return truth
-
-
-def match_arrays(*counts):
-    """The arrays of a file of matches; every fifth match is off by 30 px."""
-    views = [make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)]
-    fields = {"K": "intrinsics", "R": "rotation", "t": "translation"}
-    arrays = {key: np.stack([getattr(view, name).numpy() for view in views]) for key, name in fields.items()}
-    arrays |= {"names": np.array([view.name for view in views]), "size": np.array([[WIDTH, HEIGHT]] * len(views))}
-    for i, view in enumerate(views):
-        error = np.where(np.arange(len(view.img_points)) % 5 == 0, 30.0, 0.0)
-        arrays[f"{i:03d}_img_points"] = view.img_points.numpy() + error[:, None] * [1.0, 0.0]
-        arrays[f"{i:03d}_world_points"] = view.world_points.numpy()
-        arrays[f"{i:03d}_error_px"] = error.astype(np.float32)
-    return arrays
 
 
 def error_px(view):
