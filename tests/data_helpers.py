@@ -95,3 +95,17 @@ def make_view(name="a.jpg", count=30, seed=0, inliers=None):
 
 def make_scene(*counts, metric=True):
     return Scene("toy", tuple(make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)), (), metric)
+
+
+def match_arrays(*counts):
+    """The arrays of a file of matches; every fifth match is off by 30 px."""
+    views = [make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)]
+    fields = {"K": "intrinsics", "R": "rotation", "t": "translation"}
+    arrays = {key: np.stack([getattr(view, name).numpy() for view in views]) for key, name in fields.items()}
+    arrays |= {"names": np.array([view.name for view in views]), "size": np.array([[WIDTH, HEIGHT]] * len(views))}
+    for i, view in enumerate(views):
+        error = np.where(np.arange(len(view.img_points)) % 5 == 0, 30.0, 0.0)
+        arrays[f"{i:03d}_img_points"] = view.img_points.numpy() + error[:, None] * [1.0, 0.0]
+        arrays[f"{i:03d}_world_points"] = view.world_points.numpy()
+        arrays[f"{i:03d}_error_px"] = error.astype(np.float32)
+    return arrays

@@ -21,11 +21,8 @@ import torch
 from helpers import assert_same, other_defaults
 from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.calibration import distort_points
-from kornia.geometry.conversions import (
-    axis_angle_to_rotation_matrix,
-    denormalize_points_with_intrinsics,
-    normalize_points_with_intrinsics,
-)
+from kornia.geometry.camera import distort_points_kannala_brandt
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, normalize_points_with_intrinsics
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import pad
@@ -157,12 +154,9 @@ def distorted(
     """The pixels of a lens at which a pinhole camera sees ``pixels``."""
     if fisheye is None:
         return distort_points(pixels, intrinsics, dist)
-    plane = normalize_points_with_intrinsics(pixels, intrinsics)
-    radius = plane.norm(dim=-1, keepdim=True)
-    angle = radius.atan()
-    powers = angle ** torch.tensor([2, 4, 6, 8])
-    plane = plane * angle / radius * (1.0 + (powers * fisheye[:, None]).sum(-1, keepdim=True))
-    return denormalize_points_with_intrinsics(plane, intrinsics)
+    camera = [intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 2], intrinsics[:, 1, 2]]
+    coefficients = torch.stack([*camera, *fisheye.T], -1)[:, None]
+    return distort_points_kannala_brandt(normalize_points_with_intrinsics(pixels, intrinsics), coefficients)
 
 
 def to(dtype: torch.dtype, tree: Any) -> Any:

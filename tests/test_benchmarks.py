@@ -72,18 +72,12 @@ def test_everything_is_measured_once_at_a_commit(tmp_path):
 # -- solvers.py --------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """The file of a small run."""
+def test_every_solver_has_a_row_for_every_set_it_solves(tmp_path):
     for module in ("cv2", "poselib"):
         pytest.importorskip(module)
-    path = tmp_path_factory.mktemp("benchmark") / "solvers.json"
-    sizes = ("--count", "20", "--repeats", "3", "--memory-count", "0")
+    path, sizes = tmp_path / "solvers.json", ("--count", "20", "--repeats", "3", "--memory-count", "0")
     benchmark.main(["--out", str(path), *sizes, "--solvers", *SOLVERS])
-    return json.loads(path.read_text())
-
-
-def test_every_solver_has_a_row_for_every_set_it_solves(written):
+    written = json.loads(path.read_text())
     rows = {(row["solver"], row["set"]): row for row in written["rows"]}
     small = {name for name, (n, *_) in benchmark.SETS.items() if n == benchmark.SMALL}
     expected = {(spec, name) for spec in SOLVERS for name in small}
@@ -148,16 +142,13 @@ def test_contenders_solve_and_differentiate(name, make_problems):
         assert pixels.abs().sum() > 0
 
 
-class Uncompiled(nn.Linear):
-    """Warns as a solver does on a machine without a compiler."""
-
-    def compile(self):
+def test_a_solver_that_does_not_compile_is_not_timed_as_compiled(monkeypatch):
+    def warn(_):
         warnings.warn("There is no compiler: computing without.", RuntimeWarning, stacklevel=2)
 
-
-def test_a_solver_that_does_not_compile_is_not_timed_as_compiled():
+    monkeypatch.setattr(nn.Linear, "compile", warn)
     with pytest.raises(contenders.CannotBeTimedError, match="no compiler"):
-        contenders.compile_or_raise(Uncompiled(1, 1))
+        contenders.compile_or_raise(nn.Linear(1, 1))
 
 
 # -- performance.py ----------------------------------------------------------------------------------------------------
@@ -165,11 +156,10 @@ def test_a_solver_that_does_not_compile_is_not_timed_as_compiled():
 SMALL = ("refinement", "epnp-lm", "opencv-ransac", "kornia-dlt")
 
 
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory):
-    """The files of a small run, in one process instead of many."""
+@pytest.mark.slow
+def test_throughput_and_latency_have_a_row_for_every_point(tmp_path, monkeypatch):
+    """A small run, in one process instead of many."""
     pytest.importorskip("cv2")
-    folder = tmp_path_factory.mktemp("performance")
 
     def here(script, *arguments, **environment):
         request = json.loads(arguments[-1])
@@ -178,15 +168,9 @@ def measured(tmp_path_factory):
         settings = performance.Settings(**request["settings"])
         return json.loads(json.dumps(performance.measure_threads(request["part"], settings, request["count"])))
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(performance, "run_child", here)
-        performance.main(["measure", "--quick", "--contenders", *SMALL, "--results", str(folder)])
-    return folder, page.load_parts(folder)[0]
-
-
-@pytest.mark.slow
-def test_throughput_and_latency_have_a_row_for_every_point(measured):
-    throughput, latency = (measured[1][part] for part in ("throughput", "latency"))
+    monkeypatch.setattr(performance, "run_child", here)
+    performance.main(["measure", "--quick", "--contenders", *SMALL, "--results", str(tmp_path)])
+    throughput, latency = (page.load_parts(tmp_path)[0][part] for part in ("throughput", "latency"))
     rows = {(row["contender"], row["threads"], row["mode"], row["n"], row["batch"]) for row in throughput["rows"]}
     small, large = performance.QUICK.batches
     forward = [(1, "forward", 6, performance.QUICK.problems), (2, "forward", 9, large)]

@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from data_helpers import match_arrays
 from strategies import run_main
 
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, list_solvers, pretrained
@@ -125,25 +126,17 @@ def test_solve_rejects_and_draws_outliers(csv_file, tmp_path):
     assert not any(pair["rejected"] for pair in others)
 
 
-def test_implausible_answers_say_which_test_failed(tmp_path, csv_file):
+def test_implausible_answers_name_a_possible_reason(csv_file):
     common = ("solve", csv_file, "--intrinsics", CAMERA)
     assert run_main(*common)[2] == ""
     world = points(40)
-    noise = np.random.default_rng(2).normal(0, 0.3, (40, 2))
-    img = seen(world) + noise
+    img = seen(world) + np.random.default_rng(2).normal(0, 0.3, (40, 2))
     img[:22] = np.random.default_rng(3).uniform((0, 0), (640, 480), (22, 2))
-    for pixels, code, expected in (
-        (img, 0, " of 40 corresp"),
-        (img[:, ::-1], 1, ""),
-        (seen(world)[:, ::-1], 1, " px of "),
-    ):
-        table = np.concatenate((world, pixels), 1)
-        np.savetxt(csv_file, table, delimiter=",", header="X,Y,Z,u,v", comments="")
-        got = run_main(*common)
-        assert got[0] == code
-        assert got[2].count("\n") == 1
-        assert expected in got[2]
-        assert "swapped columns" in got[2]
+    for pixels, expected in ((img, 0), (img[:, ::-1], 1), (seen(world)[:, ::-1], 1)):
+        np.savetxt(csv_file, np.concatenate((world, pixels), 1), delimiter=",", header="X,Y,Z,u,v", comments="")
+        code, _, err = run_main(*common)
+        assert (code, err.count("\n")) == (expected, 1)
+        assert "swapped columns" in err
     assert answer(*common[1:], "--diagnose")["diagnosis"].startswith("swap u and v: 100 % of the pairs")
 
 
@@ -249,9 +242,6 @@ def test_bad_npz_files(tmp_path):
         err = refused("solve", path)
         assert err.startswith(f"pnpnet: {path}: ")
         assert expected in err
-    for content in (b"", b"garbage\n", path.read_bytes()[:-40]):
-        path.write_bytes(content)
-        assert f"{path}: not an NPZ file" in refused("solve", path, "--intrinsics", CAMERA)
 
 
 def test_cameras_with_skew_scale_and_y_up(tmp_path):
@@ -339,8 +329,6 @@ def test_evaluate_writes_what_it_prints(tmp_path, shipped):
     assert (code, err) == (0, "")
     results = load_results(out_file)
     assert list(results["solvers"]) == default_solvers(9)
-    labels = ("0 outliers", "0-3 outliers", "2 outliers")
-    assert list(results["data"]) == [f"synthetic, n = 9, {label}" for label in labels]
     assert [entry["mean_outliers"] for entry in results["data"].values()][::2] == [0.0, 2.0]
     assert out.count("| synthetic, n = 9, 2 outliers") == len(results["solvers"])
     assert sorted(path.name for path in pictures.iterdir()) == ["errors.png", "success.png"]
@@ -353,9 +341,7 @@ def test_the_same_command_continues_and_another_is_refused(tmp_path):
     code, out, err = run_main(*common, "--n", "6,9")
     assert (code, err) == (0, "")
     assert "1 of 2 rows" in out.splitlines()[-1]
-    content = out_file.read_bytes()
     assert str(out_file) in refused(*common, "--n", "6,9", "--seed", 7)
-    assert out_file.read_bytes() == content
     assert run_main(*common, "--seed", 7, "--overwrite")[0] == 0
     (entry,) = load_results(out_file)["data"].values()
     assert entry["description"]["seed"] == 7
@@ -387,10 +373,8 @@ def test_solvers_for_another_n_are_skipped_or_refused(csv_file, tmp_path, weight
 
 
 def test_evaluate_accepts_scenes_options_and_folders(tmp_path, weights_folder):
-    world, matches, out_file = points(30), tmp_path / "scene.npz", tmp_path / "results.json"
-    view = {"K": K.numpy()[None], "R": np.eye(3)[None], "t": np.zeros((1, 3)), "size": np.array([[640, 480]])}
-    pairs = {"000_world_points": world, "000_img_points": seen(world), "000_error_px": np.zeros(30)}
-    np.savez(matches, names=np.array(["a.jpg"]), **view, **pairs)
+    matches, out_file = tmp_path / "scene.npz", tmp_path / "results.json"
+    np.savez(matches, **match_arrays(30))
     solvers = ("opencv-ransac:threshold=5,refine=false", str(weights_folder))
     common = ("evaluate", "--data", matches, "--outliers", "none,1", "--problems", 5, "--out", out_file)
     for more, unit in (((), "m"), (("--arbitrary-unit", "--overwrite"), "")):
@@ -400,7 +384,7 @@ def test_evaluate_accepts_scenes_options_and_folders(tmp_path, weights_folder):
         assert {entry["unit"] for entry in results["data"].values()} == {unit}
     assert results["solvers"][solvers[0]]["config"]["refine"] is False
     assert results["rows"][0]["success"]["rate"] == 1.0
-    refused(*common, "--solver", solvers[0], "--n", 40)
+    assert f"{matches}: no image" in refused(*common, "--solver", solvers[0], "--n", 40)
 
 
 def test_list_names_solvers_and_missing_packages(shipped, monkeypatch):

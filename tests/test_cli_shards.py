@@ -19,18 +19,6 @@ from kornia_pnpnet.arrow import OUTPUTS, Solve  # noqa: E402
 from kornia_pnpnet.cli.shards import solve_shards  # noqa: E402
 
 
-class Watched(Solve):
-    """Notes the sizes of the tables."""
-
-    def __init__(self, name):
-        super().__init__(name)
-        self.sizes = []
-
-    def __call__(self, part):
-        self.sizes.append(len(part))
-        return super().__call__(part)
-
-
 @pytest.fixture
 def solve():
     return Solve("reppnp")
@@ -60,10 +48,16 @@ def test_a_shard_is_read_in_batches_and_keeps_other_columns(shards, tmp_path, ma
     _, drawn = shards
     problems = pa.concat_tables([table(p) for p in drawn] + [table(make_problems(n=6, batch=2, dtype=torch.float32))])
     parquet.write_table(problems.append_column("id", pa.array(range(23))), tmp_path / "x.parquet")
-    solve = Watched("epnp-lm")
-    solve_shards(solve, [tmp_path / "x.parquet"], tmp_path / "out", name="epnp-lm", batch=5)
+    sizes = []
+
+    class Watched(Solve):
+        def __call__(self, part):
+            sizes.append(len(part))
+            return super().__call__(part)
+
+    solve_shards(Watched("epnp-lm"), [tmp_path / "x.parquet"], tmp_path / "out", name="epnp-lm", batch=5)
     found = parquet.read_table(tmp_path / "out" / "x.parquet")
-    assert solve.sizes == [5, 5, 5, 5, 3]
+    assert sizes == [5, 5, 5, 5, 3]
     assert found.column_names == ["id", *OUTPUTS]
     assert found["id"].to_pylist() == [*range(23)]
 

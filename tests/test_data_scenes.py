@@ -14,16 +14,6 @@ from torch.testing import assert_close
 from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems
 
 
-@pytest.mark.parametrize("outliers", [None, OutlierMix()])
-def test_inliers_reproject_exactly_and_outliers_do_not(outliers):
-    problems = SceneProblems(make_scene(40, 30), batch_size=500, outliers=outliers).batch(3)
-    error = reprojection_errors(problems).norm(dim=-1)
-    assert error[problems.inliers].max() < 1e-9
-    wrong = error[~problems.inliers]
-    assert outliers is None or wrong.median() > 50
-    assert (wrong > 1e-3).all()
-
-
 def test_the_world_is_moved_rigidly_to_the_protocols_prior():
     scene = make_scene(30)
     problems = SceneProblems(scene, batch_size=20_000).batch(0)
@@ -39,7 +29,7 @@ def test_outliers_do_not_change_points_and_poses():
         SceneProblems(make_scene(20, 30), batch_size=100, outliers=mix).batch(0) for mix in (None, OutlierMix(count=4))
     )
     assert torch.equal(clean.world_points, spoilt.world_points)
-    assert torch.equal(clean.pose.translation, spoilt.pose.translation)
+    assert torch.equal(clean.pose.matrix, spoilt.pose.matrix)
     assert torch.equal((clean.img_points == spoilt.img_points).all(-1), spoilt.inliers)
 
 
@@ -78,12 +68,13 @@ def test_fixed_number_of_mismatches_with_spares_of_their_own(count):
     assert (chosen.diff() > 0).all(), "no two pairs share a pixel"
 
 
-def test_mismatches_of_the_scene_are_marked():
-    inliers = torch.arange(40) % 4 != 0
-    view = make_view(count=40, inliers=inliers)
-    view = replace(view, img_points=view.img_points + 100.0 * ~inliers[:, None])
-    problems = SceneProblems(Scene("toy", (view,)), batch_size=500).batch(0)
-    assert torch.equal(reprojection_errors(problems).norm(dim=-1) < 1, problems.inliers)
+def test_inliers_reproject_exactly_and_mismatches_of_the_scene_are_marked():
+    views = []
+    for view in make_scene(40, 28).views:
+        inliers = torch.arange(len(view.inliers)) % 4 != 0
+        views.append(replace(view, img_points=view.img_points + 100.0 * ~inliers[:, None], inliers=inliers))
+    problems = SceneProblems(Scene("toy", tuple(views)), batch_size=500).batch(0)
+    assert torch.equal(reprojection_errors(problems).norm(dim=-1) < 1e-9, problems.inliers)
     assert_close(problems.inliers.double().mean().item(), 0.75, rtol=0, atol=0.03)
 
 

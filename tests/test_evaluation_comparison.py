@@ -28,15 +28,15 @@ def _same_code(monkeypatch):
 
 
 class _Fixed(nn.Module):
-    """Return the identity and remember the sizes of the calls; raise KeyboardInterrupt after some calls."""
+    """Return the identity and remember the sizes of the calls; raise an error after some calls."""
 
-    def __init__(self, *, bad: float = 0.0, calls: float = math.inf) -> None:
+    def __init__(self, *, bad: float = 0.0, calls: float = math.inf, error: BaseException | None = None) -> None:
         super().__init__()
-        self.bad, self.calls, self.sizes = bad, calls, []
+        self.bad, self.calls, self.error, self.sizes = bad, calls, error or KeyboardInterrupt(), []
 
     def forward(self, world_points, img_points, intrinsics):
         if len(self.sizes) >= self.calls:
-            raise KeyboardInterrupt
+            raise self.error
         assert not self.training
         assert not torch.is_grad_enabled()
         batch = len(world_points)
@@ -298,15 +298,10 @@ def test_only_bounds_get_the_truth(sets):
 
 def test_only_our_solvers_get_the_noise_level(sets):
     known = EvaluationData(draw_problems(SyntheticProblems(batch_size=40, seed=3, known_noise=1.0), count=60))
-    given = []
-
-    class Listening(PnPNet):
-        def forward(self, *args, **noise):
-            given.append(noise)
-            return super().forward(*args, **noise)
-
+    given, ours = [], PnPNet(None, RobustWeightedLM(1))
+    ours.register_forward_pre_hook(lambda _, args, noise: given.append(noise), with_kwargs=True)
     for data in (known, sets["clean"]):
-        evaluate({"ours": Listening(None, RobustWeightedLM(1)), "other": _Fixed()}, {"data": data}, chunk=60)
+        evaluate({"ours": ours, "other": _Fixed()}, {"data": data}, chunk=60)
         for noise in given:
             assert noise.keys() == data.problems.sigmas.keys()
             assert all(torch.equal(noise[name], sigma) for name, sigma in data.problems.sigmas.items())
@@ -326,12 +321,9 @@ def test_a_solver_for_another_n_is_left_out(path):
 
 
 def test_an_error_says_where_it_was_and_keeps_the_rows(sets, path):
-    class Broken(_Fixed):
-        def forward(self, *_):
-            raise RuntimeError("no memory")
-
+    broken = _Fixed(calls=0, error=RuntimeError("no memory"))
     with pytest.raises(RuntimeError, match="no memory") as caught:
-        evaluate({"fixed": _Fixed(), "broken": Broken()}, sets, path=path)
+        evaluate({"fixed": _Fixed(), "broken": broken}, sets, path=path)
     assert caught.value.__notes__ == ["broken on clean"]
     assert len(load_results(path)["rows"]) == 1
 

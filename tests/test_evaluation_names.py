@@ -7,7 +7,6 @@ import torch
 from data_helpers import make_view, same
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from kornia.core.exceptions import ValueCheckError
 
 import kornia_pnpnet.evaluation.problem_sets
 from kornia_pnpnet import PnPNet, list_solvers
@@ -26,8 +25,6 @@ def test_bounds_take_options():
     assert isinstance(bound, KnownInliersAndNoise)
     assert bound.config == {"img_sigma": 1.0, "world_sigma": 0.01}
     assert not bound.training
-    with pytest.raises(ValueCheckError, match="known-inliers"):
-        load_solver("known-inliers:world_sigma=0.01")
 
 
 def test_a_name_wins_over_a_folder_of_that_name(tmp_path, monkeypatch):
@@ -80,10 +77,9 @@ def draw(*sources, outliers="none", n=9, count=20, **options):
 
 
 def test_synthetic_sets_are_the_protocols():
-    ((name, entry),) = draw("synthetic", outliers="2").items()
+    (entry,) = draw("synthetic", outliers="2").values()
     expected = SyntheticProblems(batch_size=1000, seed=3, outliers=OutlierMix(count=2)).batch(0)
     assert same(entry.problems, expected.map(lambda part: part[:20]))
-    assert name == "synthetic, n = 9, 2 outliers"
     assert entry.description == {"source": "paper", "outliers": 2, "mismatch_share": 0.5, "seed": 3}
     assert (entry.max_rotation_deg, entry.max_translation, entry.unit) == (1.0, 0.2, "m")
 
@@ -125,17 +121,11 @@ def test_words_for_outliers(word, n, counts, called, label):
     assert (name, entry.description["outliers"]) == (f"synthetic, n = {n}, {label}", called)
 
 
-def test_mismatches_only_are_pixels_of_other_points(scenes):
-    known = scene().views[0].img_points
-
-    def distances(**options):
-        ((name, entry),) = draw("room", outliers="4", count=200, dtype=torch.float64, **options).items()
-        return name, torch.cdist(entry.problems.img_points, known.expand(200, -1, -1)).amin(-1)
-
-    name, distance = distances(mismatches_only=True)
+def test_mismatches_only_have_pixels_of_their_own(scenes):
+    ((name, entry),) = draw("room", outliers="4", count=1000, mismatches_only=True, dtype=torch.float64).items()
     assert name == "room, n = 9, 4 mismatches"
-    assert distance.max() < 0.1
-    assert (distances()[1] > 1.0).sum(-1).double().mean() == pytest.approx(2.0, abs=0.3)
+    mix = OutlierMix(count=4, mismatch_share=1.0)
+    assert same(entry.problems, SceneProblems(scene(), seed=3, outliers=mix, num_spares=4).batch(0))
 
 
 def test_every_n_has_every_mix_and_a_set_is_the_same_beside_others(scenes):
@@ -150,14 +140,13 @@ def test_every_n_has_every_mix_and_a_set_is_the_same_beside_others(scenes):
 
 def test_scenes_are_the_protocols(scenes):
     """The limits depend on the unit."""
-    ((name, entry),) = draw("here/room", outliers="2", count=1000, dtype=torch.float64).items()
-    assert name == "room, n = 9, 2 outliers"
+    (entry,) = draw("here/room", outliers="2", count=1000, dtype=torch.float64).values()
     described = {"source": "room", "path": "here/room", "outliers": 2, "mismatch_share": 0.5, "seed": 3}
     assert entry.description == described
     drawn = SceneProblems(scene(), seed=3, outliers=OutlierMix(count=2))
     assert same(entry.problems, drawn.batch(0))
     assert (entry.max_translation, entry.unit) == (0.2, "m")
-    ((_, arbitrary),) = draw("here/room", metric=False).items()
+    (arbitrary,) = draw("here/room", metric=False).values()
     assert (arbitrary.max_translation, arbitrary.unit) == (0.005 * scene().median_depth, "")
 
 
@@ -165,8 +154,3 @@ def test_sets_of_scenes_are_named(scenes):
     assert list(draw("raw.npz", outliers="1")) == ["raw, n = 9, +1 outlier"]  # raw matches have outliers of their own
     sets = draw("a/room", "b/room", "a/room")
     assert list(sets) == ["room, n = 9, 0 outliers", "b/room, n = 9, 0 outliers"]
-
-
-def test_a_scene_with_too_few_points_says_so(scenes):
-    with pytest.raises(ValueCheckError, match=r"a/room.* 61 .*n = 60"):
-        draw("a/room", n=60)

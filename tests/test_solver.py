@@ -211,36 +211,20 @@ def test_a_pair_is_left_out_if_its_confidence_is_no_probability(name, make_probl
     assert (solver(*p[:3], confidence=percent).status == Status.CONFIDENCE).all()
 
 
-NO_ROTATIONS = {
-    "float16": lambda x: x.half().double(),
-    "similarity": lambda x: 1.02 * x,
-    "drifted": lambda x: x + 0.01 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0)).double(),
-}
-
-
-@pytest.mark.parametrize("kind", NO_ROTATIONS)
-def test_a_given_matrix_becomes_the_nearest_rotation(kind, make_problems):
+def test_a_given_matrix_becomes_the_nearest_rotation(make_problems, generator):
+    """A start and the pose of a prior, after scaling and with an error in each entry."""
     p, solver = make_problems(), PnPNet(None)
-    changed = NO_ROTATIONS[kind](p.pose.rotation)
+    changed = 1.02 * p.pose.rotation + 0.01 * torch.randn(7, 3, 3, generator=generator)
     left, _, right = torch.linalg.svd(changed)
-    (given, nearest), known = (
-        (Pose(x, p.pose.translation) for x in (changed, left @ right)),
-        torch.eye(6).double().expand(7, 6, 6),
-    )
+    given, nearest = (Pose(x, p.pose.translation) for x in (changed, left @ right))
+    information = torch.eye(6).double().expand(7, 6, 6)
     for found, expected in (
         (solver(*p[:3], init=given), solver(*p[:3], init=nearest)),
-        (solver(*p[:3], prior=PosePrior(given, known)), solver(*p[:3], prior=PosePrior(nearest, known))),
+        (solver(*p[:3], prior=PosePrior(given, information)), solver(*p[:3], prior=PosePrior(nearest, information))),
     ):
         assert found.ok.all()
         assert_same(found.pose, expected.pose, 1e-9, 1e-9)
         assert_same(found.init, nearest, 1e-9, 1e-9)
-
-
-def test_a_given_matrix_has_the_gradient_of_the_nearest_rotation(make_problems):
-    p = make_problems(batch=2)
-    matrix = (1.02 * p.pose.rotation).requires_grad_()
-    first = lambda x: PnPNet(None)(*p[:3], init=Pose(x, p.pose.translation)).init.rotation  # noqa: E731
-    assert torch.autograd.gradcheck(first, matrix)
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, torch.nan])

@@ -3,7 +3,6 @@
 import math
 import multiprocessing
 import os
-import re
 import signal
 import sys
 import threading
@@ -95,28 +94,15 @@ def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, 
     assert (report.update, report.interrupted) == (3, True)
     assert signal.getsignal(number) is handler
     assert len(read_history(tmp_path / "parts")) == 3
+    with (tmp_path / "parts" / HISTORY_NAME).open("r+") as file:
+        last = file.readlines()[-1]
+        file.write(f"4{last[1:]}2")  # a killed run has rows beyond its last checkpoint, and the last row may be cut
 
     again = {**make_parts(), "model": PnPNet(MLPInit(6), RobustWeightedLM(2))}  # other weights at first
     report = fit(folder=tmp_path / "parts", resume=True, data_workers=workers_later, **again)
     assert (report.update, report.interrupted) == (6, False)
     assert_same(whole["model"].state_dict(), again["model"].state_dict())
     assert comparable(read_history(tmp_path / "parts")) == comparable(read_history(tmp_path / "whole"))
-
-
-def test_history_after_the_checkpoint_is_written_again(tmp_path):
-    """A killed run has rows beyond its last checkpoint. Resuming replaces these rows."""
-    fit(folder=tmp_path / "whole", **make_parts())
-
-    def crash():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit(folder=tmp_path / "killed", **{**make_parts(checkpoint_every=4), "loss": LossWith(crash, at=(6,))})
-    assert [row["update"] for row in read_history(tmp_path / "killed")] == ["1", "2", "3", "4", "5"]
-    with (tmp_path / "killed" / HISTORY_NAME).open("a") as file:
-        file.write("2")  # of 21: a crash can tear the last row
-    fit(folder=tmp_path / "killed", resume=True, **make_parts(checkpoint_every=4))
-    assert comparable(read_history(tmp_path / "killed")) == comparable(read_history(tmp_path / "whole"))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -170,14 +156,6 @@ def test_a_run_becomes_longer_with_the_schedule_of_the_longer_run(tmp_path):
         settings = make_parts(updates=length)["settings"]
         assert float(row["lr"]) == pytest.approx(settings.lr * settings.lr_factor(update), rel=1e-5)
         assert float(row["ramp"]) == pytest.approx(settings.ramp_factor(update), rel=1e-5)
-
-
-def test_each_phase_of_a_run_has_a_progress_bar(tmp_path, capsys):
-    """Updates of the network alone are faster, and say nothing about the time of later updates."""
-    fit(folder=tmp_path, **{**make_parts(ramp=(0.5, 0.6)), "progress": True})
-    bars = capsys.readouterr().err
-    assert re.search(r"network alone: 100%\|.+\| 3/3", bars)
-    assert re.search(r"with refinement: 100%\|.+\| 6/6", bars)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])
