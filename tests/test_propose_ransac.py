@@ -24,18 +24,14 @@ from kornia_pnpnet.refine.residual import project
 # --- samples ----------------------------------------------------------------------------------------------------------
 
 
-def uniform_numbers(count, size):
-    return torch.rand(count, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-
 @pytest.mark.parametrize(
     "chances", [[0.5, 0.2, 0.0, 0.2, 0.1], [0.2] * 5 + [0.0]], ids=["some are likelier", "all are equally likely"]
 )
 @pytest.mark.parametrize("size", [1, 3])
-def test_items_are_drawn_by_their_chances_and_none_twice(size, chances):
+def test_items_are_drawn_by_their_chances_and_none_twice(size, chances, generator):
     """Items one after the other in proportion to their probabilities among those that are left."""
     draws, upper = 40000, torch.tensor(chances, dtype=torch.float64).cumsum(-1)[None]
-    subsets = draw(uniform_numbers(draws, size), upper)[0]
+    subsets = draw(torch.rand(draws, size, generator=generator, dtype=torch.float64), upper)[0]
     likely = [i for i, chance in enumerate(chances) if chance]
     for order in itertools.permutations(likely, size):
         drawn = [chances[i] for i in order]
