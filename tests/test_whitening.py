@@ -4,13 +4,11 @@ import math
 
 import pytest
 import torch
-from helpers import assert_same
+from helpers import assert_same, derivative, reprojection_errors
 from kornia.core.exceptions import ValueCheckError
-from kornia.geometry.conversions import convert_points_from_homogeneous
 
 from kornia_pnpnet import (
     PnPNet,
-    Pose,
     RobustWeightedLM,
     create_solver,
     monte_carlo_pose_loss,
@@ -19,6 +17,7 @@ from kornia_pnpnet import (
 )
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.problem import State
 from kornia_pnpnet.refine.residual import retract
 
 DOUBLE = torch.float64
@@ -44,20 +43,18 @@ def least_squares(m=30, **options):
     return PnPNet(None, RobustWeightedLM(m, **options))
 
 
-def whitened(p, i, pose):
-    """Of one problem: the Jacobian (2N, 6) by the tangent and the residual (2N), all derivatives by autograd."""
+def whitened(p, pose):
+    """The Jacobian (B, 2N, 6) by the tangent and the residual (B, 2N), all derivatives by autograd."""
 
-    def seen(tangent, world):
-        moved = retract(Pose(*(x[None] for x in pose)), tangent[None])
-        return convert_points_from_homogeneous((world @ moved.rotation[0].mT + moved.translation[0]) @ CAMERA.mT)
+    def total(world):
+        return reprojection_errors(p._replace(world_points=world), pose).sum((0, 1))
 
-    zero, world = torch.zeros(6, dtype=DOUBLE), p.world_points[i]
-    jacobian = torch.autograd.functional.jacobian(lambda x: seen(x, world), zero)  # (N, 2, 6)
-    by_point = torch.autograd.functional.jacobian(lambda x: seen(zero, x).sum(0), world).movedim(1, 0)  # (N, 2, 3)
-    covariance = p.img_cov[i] + by_point @ p.world_cov[i] @ by_point.mT
+    residual = reprojection_errors(p, pose)
+    jacobian = derivative(lambda x: reprojection_errors(p, x.pose).flatten(1), State.of(pose))
+    by_point = torch.autograd.functional.jacobian(total, p.world_points).movedim(0, 2)  # (B, N, 2, 3)
+    covariance = p.img_cov + by_point @ p.world_cov @ by_point.mT
     whiten = torch.linalg.inv(torch.linalg.cholesky(covariance))
-    residual = seen(zero, world) - p.img_points[i]
-    return (whiten @ jacobian).flatten(0, 1), (whiten @ residual[..., None]).flatten()
+    return (whiten @ jacobian.unflatten(1, (-1, 2))).flatten(1, 2), (whiten @ residual[..., None]).flatten(1)
 
 
 # -- against other ways to say the same ----------------------------------------------------------------------------
@@ -68,19 +65,16 @@ def test_poses_covariances_and_weights_are_those_of_a_dense_solver():
     result = least_squares()(*p[:3], init=p.pose, **covs(p))
     robust = least_squares(kernel="cauchy", robustness=3.0)(*p[:3], init=p.pose, **covs(p))
     covariance = pose_covariance(result.pose, *p[:3], **covs(p))
-    for i in range(4):
-        pose = Pose(p.pose.rotation[i], p.pose.translation[i])
-        for _ in range(30):
-            jacobian, residual = whitened(p, i, pose)
-            step = -torch.linalg.lstsq(jacobian, residual[:, None]).solution[:, 0]
-            pose = Pose(*(x[0] for x in retract(Pose(*(x[None] for x in pose)), step[None])))
-        torch.testing.assert_close(result.rotation[i], pose.rotation, rtol=0, atol=1e-9)
-        torch.testing.assert_close(result.translation[i], pose.translation, rtol=0, atol=1e-7)
-        information = jacobian.mT @ jacobian
-        torch.testing.assert_close(covariance[i], torch.linalg.inv(information), rtol=1e-6, atol=1e-12)
-        _, residual = whitened(p, i, Pose(robust.rotation[i], robust.translation[i]))
-        distance = residual.view(-1, 2).square().sum(-1)
-        torch.testing.assert_close(robust.weights[i], 1.0 / (1.0 + distance / 9.0), rtol=1e-6, atol=0)
+    pose = p.pose
+    for _ in range(30):
+        jacobian, residual = whitened(p, pose)
+        pose = retract(pose, -torch.linalg.lstsq(jacobian, residual[..., None]).solution[..., 0])
+    torch.testing.assert_close(result.rotation, pose.rotation, rtol=0, atol=1e-9)
+    torch.testing.assert_close(result.translation, pose.translation, rtol=0, atol=1e-7)
+    torch.testing.assert_close(covariance, torch.linalg.inv(jacobian.mT @ jacobian), rtol=1e-6, atol=1e-12)
+    _, residual = whitened(p, robust.pose)
+    distance = residual.unflatten(1, (-1, 2)).square().sum(-1)
+    torch.testing.assert_close(robust.weights, 1.0 / (1.0 + distance / 9.0), rtol=1e-6, atol=0)
 
 
 def test_an_isotropic_covariance_is_a_sigma():
