@@ -3,6 +3,8 @@
 import pytest
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from laws import PAIRS, Case, make
+from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import PnPResult, Pose, PosePrior, create_solver, pose_covariance
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -83,30 +85,20 @@ def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sig
     torch.testing.assert_close(alone.covariance(*(x[0] for x in p[:3])), covariance[0])
 
 
-def test_gradients(make_problems):
-    p = make_problems(n=5, batch=2)
-    world, img, camera, pose = p[:4]
-    weights = torch.linspace(0.1, 0.9, 10, dtype=torch.float64).view(2, 5)
-    sigma = torch.full((2, 5), 1.5, dtype=torch.float64)
-    img_cov = torch.diag_embed(torch.tensor([1.0, 2.0], dtype=torch.float64)).expand(2, 5, 2, 2).clone()
+@pytest.mark.parametrize("case", [Case("epnp-lm", noise="sigma"), Case("epnp-lm", noise="covariance", extra="prior")])
+def test_gradients(case):
+    """By all inputs. As in ``laws.gradcheck`` each of them moves relative to its own size."""
+    call, pose = make(case, 1)
+    call |= {"pose": pose, "weights": torch.linspace(0.1, 0.9, PAIRS, dtype=torch.float64)[None]}
+    leaves, spec = pytree.tree_flatten(call)
+    sizes = [x.abs().mean() if x.shape[1:] in ((PAIRS, 2), (PAIRS, 3)) else x for x in leaves]
 
-    def isotropic(translation, world, img, sigma, weights):
-        moved = Pose(pose.rotation, translation)
-        return pose_covariance(moved, world, img, camera, img_sigma=sigma, weights=weights)
+    def run(*changes):
+        moved = [x + size * d for x, size, d in zip(leaves, sizes, changes, strict=True)]
+        return pose_covariance(**pytree.tree_unflatten(moved, spec))
 
-    inputs = [x.clone().requires_grad_() for x in (pose.translation, world, img, sigma, weights)]
-    assert torch.autograd.gradcheck(isotropic, inputs, eps=1e-6, atol=1e-6, rtol=1e-3)
-
-    world_cov = 0.04 * torch.diag_embed(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)).expand(2, 5, 3, 3).clone()
-    information = torch.diag_embed(torch.tensor([1e3, 2e3, 3e3, 4.0, 5.0, 6.0], dtype=torch.float64)).repeat(2, 1, 1)
-
-    def anisotropic(*matrices):
-        img_cov, world_cov, information = (0.5 * (x + x.mT) for x in matrices)
-        prior = PosePrior(pose, information)
-        return pose_covariance(pose, world, img, camera, img_cov=img_cov, world_cov=world_cov, prior=prior)
-
-    inputs = [x.requires_grad_() for x in (img_cov, world_cov, information)]
-    assert torch.autograd.gradcheck(anisotropic, inputs, eps=1e-6, atol=1e-6, rtol=1e-3)
+    changes = [torch.zeros_like(x).requires_grad_() for x in leaves]
+    assert torch.autograd.gradcheck(run, changes, eps=1e-6, atol=1e-6, rtol=1e-3, fast_mode=True)
 
 
 def test_an_unknown_focal_length_is_that_of_the_result(make_problems):
