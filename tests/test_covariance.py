@@ -3,7 +3,7 @@
 import pytest
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from laws import PAIRS, Case, make
+from laws import PAIRS, Case, make, make_bad
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import PnPResult, Pose, PosePrior, create_solver, pose_covariance
@@ -17,9 +17,12 @@ def tangent(estimate, truth):
 
 
 def test_zero_weight_equals_removing(make_problems):
+    """Such pairs may hold any numbers."""
     p = make_problems(n=12, batch=5)
     weights = (torch.arange(12) < 8).double().expand(5, 12)
-    half = pose_covariance(p.pose, *p[:3], img_sigma=2.0, weights=weights)
+    world, sigma = p.world_points.clone(), torch.full((5, 12), 2.0, dtype=torch.float64)
+    world[:, 8:], sigma[:, 8:] = torch.nan, torch.nan
+    half = pose_covariance(p.pose, world, *p[1:3], img_sigma=sigma, weights=weights)
     part = pose_covariance(p.pose, p.world_points[:, :8], p.img_points[:, :8], p.intrinsics, img_sigma=2.0)
     torch.testing.assert_close(half, part)
 
@@ -38,21 +41,21 @@ def test_units_of_the_noise(make_problems):
     torch.testing.assert_close(large, plain * unit * unit[:, None])
 
 
-def test_an_undetermined_pose_has_infinite_variances_and_no_gradient(make_problems):
-    p = make_problems(n=6, batch=3)
-    weights = torch.ones(3, 6, dtype=torch.float64)
-    weights[1, 2:] = 0.0  # two pairs
-    world = p.world_points.clone()
-    world[2] = world[2, :1] + torch.arange(6.0)[:, None] * torch.eye(3)[0]  # one line
-    world.requires_grad_()
-    covariance = pose_covariance(p.pose, world, *p[1:3], img_sigma=1.0, weights=weights)
-    assert covariance[0].isfinite().all()
-    for undetermined in covariance[1:]:
-        assert undetermined.diagonal().isinf().all()
-        assert (undetermined - undetermined.diagonal().diag()).nan_to_num(0.0).eq(0).all()
-    (gradient,) = torch.autograd.grad(covariance[0].sum(), world)
-    assert gradient.isfinite().all()
-    assert not gradient[1:].any()
+@pytest.mark.parametrize("noise", ["sigma", "covariance"])
+def test_an_undetermined_pose_has_infinite_variances_and_no_gradient(noise):
+    """And changes no other covariance."""
+    case = Case("epnp-lm", noise=noise)
+    kinds, sound, bad = make_bad(case)
+    _, pose = make(case, len(sound["weights"]))
+    leaves = [x.requires_grad_() for x in bad.values()]
+    found, expected = pose_covariance(pose, **bad), pose_covariance(pose, **sound)
+    assert torch.equal(found[::2], expected[::2])
+    assert expected.isfinite().all()
+    infinite = torch.diag(torch.full((6,), torch.inf, dtype=torch.float64))
+    assert torch.equal(found[1::2], infinite.expand(len(kinds), 6, 6)), kinds
+    for gradient in torch.autograd.grad(found[::2].sum(), leaves):
+        assert gradient.isfinite().all()
+        assert not gradient[1::2].any()
 
 
 @pytest.mark.parametrize(("n", "outliers"), [(12, 0), (20, 5)])

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from kornia.core.exceptions import ShapeError
 
 from kornia_pnpnet import Pose, diagnose
 
@@ -82,9 +81,3 @@ def test_random_pairs_have_no_diagnosis():
     assert found.best == ()
     invalid = diagnose(points, pixels, torch.zeros(3, 3))
     assert invalid.best == ()
-
-
-def test_bearings_are_refused():
-    points, pixels, _ = problem()
-    with pytest.raises(ShapeError, match="pixels"):
-        diagnose(points, torch.cat((pixels, pixels[:, :1]), -1), camera())

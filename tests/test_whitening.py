@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 from helpers import assert_same, derivative, reprojection_errors
-from kornia.core.exceptions import ValueCheckError
 
 from kornia_pnpnet import (
     PnPNet,
@@ -84,7 +83,7 @@ def test_an_isotropic_covariance_is_a_sigma():
     torch.testing.assert_close(found, pose_covariance(p.pose, *p[:3], img_cov=p.img_cov, world_sigma=sigma))
 
 
-# -- bad covariances -----------------------------------------------------------------------------------------------
+# -- exact measurements -----------------------------------------------------------------------------------------------
 
 
 def test_exact_points_and_exact_pixels_are_sound():
@@ -96,30 +95,6 @@ def test_exact_points_and_exact_pixels_are_sound():
     result = create_solver("epnp-lm")(*p[:3], img_cov=flat, world_cov=problems(batch=20).world_cov)
     assert result.matrix.isfinite().all()
     assert result.ok.double().mean() > 0.9
-
-
-@pytest.mark.parametrize(
-    "call", [pose_covariance, lambda pose, *p, **noise: monte_carlo_pose_loss(pose, pose, *p, **noise)]
-)
-def test_a_sigma_beside_a_covariance_is_an_error(call):
-    p = problems()
-    pixels = {"img_sigma": 1.0, "img_cov": p.img_cov}
-    points = {"img_sigma": 1.0, "world_sigma": 0.1, "world_cov": p.world_cov}
-    for name, noise in (("img", pixels), ("world", points), ("img", {})):
-        with pytest.raises(ValueCheckError, match=f"{name}_sigma or {name}_cov"):
-            call(p.pose, *p[:3], **noise)
-
-
-def test_undetermined_where_a_covariance_is_bad():
-    p = problems(batch=3)
-    bad, weights = p.world_cov.clone(), torch.ones(3, 9, dtype=DOUBLE)
-    bad[1, 2] *= -1.0
-    noise = {"img_cov": p.img_cov, "world_cov": bad}
-    covariance = pose_covariance(p.pose, *p[:3], **noise)
-    assert covariance[1].diagonal().isinf().all()
-    assert torch.equal(covariance[[0, 2]], pose_covariance(p.pose, *p[:3], **covs(p))[[0, 2]])
-    weights[1, 2] = 0.0
-    assert pose_covariance(p.pose, *p[:3], **noise, weights=weights).isfinite().all()
 
 
 # -- what it is for ------------------------------------------------------------------------------------------------
