@@ -81,8 +81,6 @@ def test_shipped_weights_have_a_checksum_and_the_card_of_their_run(name, tmp_pat
     for part in ("init", "refine", "normalize"):  # runs recorded options that there are no longer, too
         recorded = results.model[part]
         assert all(recorded[option] == value for option, value in loaded[part].items() if option in recorded)
-    updates = sum(run.run.update for run in results.lineage())
-    assert updates >= (40_000 if name == "pnpnet-set" else 200_000)
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
     content = bytearray((folder / "model.safetensors").read_bytes())
     content[-5] ^= 1

@@ -10,7 +10,6 @@ from kornia.geometry.calibration import distort_points
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_covariance
 from kornia_pnpnet.data import CameraProblems
-from kornia_pnpnet.export import export_program
 from kornia_pnpnet.propose.focal import scale_focal
 from kornia_pnpnet.refine.residual import retract
 from kornia_pnpnet.refine.residual import rotation_angle as angle
@@ -91,12 +90,6 @@ def test_the_covariance_has_the_focal_length_last():
     assert squares[result.ok].mean().item() == pytest.approx(7.0, rel=0.1)
     last = log_focal[:, 0].square() / covariance[:, 6, 6]
     assert last[result.ok].mean().item() == pytest.approx(1.0, rel=0.1)
-
-
-@pytest.mark.parametrize(("name", "radial"), [("p3p-ransac", 0), ("epnp-lm", 0), ("pnpnet-set", 1)])
-def test_a_search_cannot_be_exported(name, radial):
-    with pytest.raises(BaseError, match="depends on the data"):
-        export_program(create_solver(name, focal="unknown", radial=radial))
 
 
 def test_the_search_helps_where_the_network_does_not_suffice():
