@@ -15,9 +15,8 @@ from kornia_pnpnet.problem import Noise, Problem, State
 
 ROOT = Path(__file__).parents[1]
 SOLVERS = ("pnpnet-set", "p3p-ransac", "epnp-lm", "pnpnet-n20")
-#: Largest share of the far-off poses that are ``ok``, by kind, and where it is larger: 20 pairs of a wrong convention
-#: often fit an incorrect pose.
-MOST, MOST_OF = 0.05, {"20 pairs": 0.4}
+#: Largest share of the far-off poses that are ``ok``. 20 pairs of a wrong convention often fit an incorrect pose.
+MOST, MOST_OF_20 = 0.05, 0.4
 
 
 def drawn(pairs, outliers, sigma):
@@ -47,14 +46,14 @@ def test_given_noise_is_kept_unless_the_residuals_contradict():
 
 
 def test_evidence_rises_with_pairs_and_falls_with_noise_and_with_an_incorrect_pose(perturb):
-    few, many, noisy = (found(*scene(*x)).log_ratio.median() for x in ((10, 2, 0.5), (40, 8, 0.5), (40, 8, 5.0)))
+    few, many, noisy = (found(*scene(*x)).log_ratio.median() for x in ((10, 2, 1.0), (40, 8, 1.0), (40, 8, 10.0)))
     assert 0.0 < few < noisy < many
-    problem, pose = scene(40, 8, 0.5)
+    problem, pose = scene(40, 8, 1.0)
     assert (found(problem, perturb(pose, angle=0.35, shift=0.0)).log_ratio < 0).all()
 
 
 def test_copies_share_one_vote():
-    problem, pose = scene(12, 3, 0.5)
+    problem, pose = scene(12, 3, 1.0)
     twice = Problem.of(*(x.repeat(1, 2, 1) for x in problem[:2]), 1000.0)
     votes = Votes.of(twice, twice.weights[:, :1] < 0).pairs
     torch.testing.assert_close(votes.sum(1), torch.full((50,), 12.0, dtype=torch.float64))
@@ -74,21 +73,21 @@ def test_doubtful_poses_are_not_ok_and_right_poses_of_tags_are(name):
         turn = torch.full((100,), torch.inf)
         if kind.truth is not None:
             turn = pose_errors(result.pose, kind.truth).rotation_error_deg
-        most = next((value for key, value in MOST_OF.items() if kind.name.startswith(key)), MOST)
+        most = MOST_OF_20 if kind.name.startswith("20 pairs") else MOST
         assert (result.ok & (turn > 10.0)).double().mean() <= most, kind.name
         if kind.name.startswith(("tag of 100", "tag of 400")) and name != "epnp-lm":
             assert result.ok[turn < 2.0].double().mean() >= 0.85, kind.name
             assert result.inliers[turn < 2.0].double().mean() > 0.98, kind.name
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.5, 3.0, 12.0])
+@pytest.mark.parametrize("sigma", [0.1, 1.0, 6.0, 24.0])
 @pytest.mark.parametrize("outliers", [0, 60])
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac"])
 def test_the_noise_and_the_inliers_are_those_of_the_data(name, sigma, outliers):
     p = drawn(100, outliers, sigma)
     solver = create_solver(name, **({"threshold": 4.0 * sigma} if name == "p3p-ransac" else {}))
     result = solver(*p[:3])
-    assert result.sigma.median() == pytest.approx(sigma, rel=0.1 if sigma < 10.0 else 0.2)
+    assert result.sigma.median() == pytest.approx(sigma, rel=0.1 if sigma < 20.0 else 0.2)
     assert result.inliers[p.inliers].double().mean() > 0.98
     assert not outliers or result.inliers[~p.inliers].double().mean() < 0.1
 

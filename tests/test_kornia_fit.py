@@ -96,9 +96,14 @@ def test_rotation_vectors_become_rotations_and_back_with_finite_gradients(angle,
 
 
 @pytest.mark.parametrize("cameras", [1, 3])
-def test_our_projection_is_kornias(cameras, generator):
+def test_our_projection_is_kornias(cameras, random_rotations, generator):
     """Cameras with zoom, and rigs, whose pairs have a pose of their own."""
     p = CameraProblems(n=5, batch_size=7, seed=0, cameras=cameras, dtype=torch.float64).batch(0)
+    if cameras > 1:  # at any turn
+        rig = Pose(random_rotations(35).unflatten(0, (7, 5)), p.cam_from_rig.translation)
+        in_rig = (rig.rotation.mT @ (p.true_cam_points - rig.translation)[..., None])[..., 0]
+        world = (in_rig - p.pose.translation[:, None]) @ p.pose.rotation
+        p = p._replace(world_points=world, cam_from_rig=rig)
     zoom = 0.2 * torch.randn(7, 1, generator=generator, dtype=torch.float64) * (cameras == 1)
     problem = Problem.of(p.world_points, torch.zeros_like(p.img_points), 800.0, rig=p.cam_from_rig)
     found = project(State(p.pose, zoom), problem).residual.permute(2, 1, 0)

@@ -17,10 +17,14 @@ from kornia_pnpnet.refine.residual import normal_equations, project, retract
 FOCAL, RADIAL = 3400.0, torch.tensor([[0.05, -0.02]], dtype=torch.float64)
 
 
-def scene(camera, unknown):
+def scene(camera, unknown, turn):
     """Points in front of cameras but for one, and a state with unknown parameters of the camera."""
     options = {"cameras": 1 if camera == "pixels" else 3, "baseline": 0.1 if camera == "rig" else 0.0}
     p = CameraProblems(n=9, batch_size=7, seed=0, dtype=torch.float64, **options).batch(0)
+    if p.cam_from_rig is not None:  # whose cameras turn about one axis
+        rig = p.cam_from_rig._replace(rotation=p.cam_from_rig.rotation @ turn.mT[:, None])
+        pose = Pose(turn @ p.pose.rotation, (turn @ p.pose.translation[..., None])[..., 0])
+        p = p._replace(pose=pose, cam_from_rig=rig)
     to_camera = p.pose.rotation if p.cam_from_rig is None else p.cam_from_rig.rotation[:, 0] @ p.pose.rotation
     p.world_points[0, 0] -= 1000.0 * to_camera[0, 2]  # to the far side of the camera
     known = torch.cat((torch.linspace(-0.1, 0.1, 7).double()[:, None], RADIAL.expand(7, 2)), 1)[:, :unknown]
@@ -31,9 +35,9 @@ def scene(camera, unknown):
 @pytest.mark.parametrize(
     ("camera", "unknown"), [("pixels", 0), ("rig", 0), ("bearings", 0), *(("pixels", k) for k in (1, 2, 3))]
 )
-def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, monkeypatch, generator):
+def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, random_rotations, monkeypatch, generator):
     """Both forms of them, for weights and for matrices as weights."""
-    state, problem = scene(camera, unknown)
+    state, problem = scene(camera, unknown, random_rotations(7))
     jacobian = verified_derivative(lambda x: project(x, problem).residual.flatten(0, 1).mT, state).unflatten(1, (2, 9))
     projection = project(state, problem)
     assert projection.in_front.sum() == 62
