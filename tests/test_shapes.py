@@ -63,7 +63,8 @@ WRONG = {
     "true poses": lambda: likelihood(POSES, POSES, torch.ones(3, 5, 3), torch.zeros(3, 5, 2), CAMERA),
     "both kinds of pixel noise": lambda: likelihood(img_cov=torch.zeros(2, 5, 2, 2)),
     "both kinds of point noise": lambda: covariance(img_sigma=1.0, world_sigma=0.1, world_cov=torch.zeros(2, 5, 3, 3)),
-    "no noise": lambda: covariance(world_sigma=0.1),
+    "no noise of a covariance": lambda: covariance(world_sigma=0.1),
+    "no noise of a loss": lambda: monte_carlo_pose_loss(POSES, POSES, POINTS, PIXELS, CAMERA),
     "bearings": lambda: diagnose(POINTS, POINTS, CAMERA),
     "matrices": lambda: POSES.camera(CAMERA.expand(3, 3, 3)),
 }
