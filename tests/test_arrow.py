@@ -37,8 +37,7 @@ def test_poses_are_those_of_a_call(name, draw):
     if name == "poselib":
         pytest.importorskip("poselib")
     problems, table = draw()
-    with torch.no_grad():
-        expected = create_solver(name)(*problems[:3])
+    expected = create_solver(name)(*problems[:3])
     found = Solve(name)(table)
     assert found["ok"].to_pylist() == expected.ok.tolist()
     for key in ("rotation", "translation", "weights", "cost"):
@@ -51,10 +50,7 @@ def test_weights_sigmas_and_options_reach_the_solver(draw):
     world_sigma = np.full((7, 1), 0.05, np.float32)
     problems, table = draw(weights=weights, img_sigma=img_sigma, world_sigma=world_sigma)
     tensors = {"weights": weights, "img_sigma": img_sigma, "world_sigma": world_sigma.repeat(9, 1)}
-    with torch.no_grad():
-        expected = create_solver("pnpnet-set", m=3)(
-            *problems[:3], **{k: torch.from_numpy(x) for k, x in tensors.items()}
-        )
+    expected = create_solver("pnpnet-set", m=3)(*problems[:3], **{k: torch.from_numpy(x) for k, x in tensors.items()})
     as_number = table.set_column(5, "world_sigma", pa.array(world_sigma[:, 0]))
     for given in (table, as_number):
         np.testing.assert_array_equal(numbers(Solve("pnpnet-set", m=3)(given), "translation"), expected.translation)
@@ -76,8 +72,7 @@ def test_rows_of_different_numbers_of_pairs(name, draw):
     found = solve(pa.concat_tables(table for _, table in drawn))
     assert [len(x) for x in found["weights"].to_pylist()] == sizes
     for row, (problems, table) in zip(found.to_pylist(), drawn, strict=True):
-        with torch.no_grad():
-            alone = solve.solver(*problems[:3])
+        alone = solve.solver(*problems[:3])
         np.testing.assert_allclose(row["translation"], alone.translation[0], rtol=1e-3)
         np.testing.assert_allclose(row["weights"], alone.weights[0], rtol=1e-2, atol=1e-4)
         assert row["ok"] == alone.ok.item()

@@ -3,6 +3,8 @@
 import pytest
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+from laws import PAIRS, Case, make, make_bad
+from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import PnPResult, Pose, PosePrior, create_solver, pose_covariance
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -15,9 +17,12 @@ def tangent(estimate, truth):
 
 
 def test_zero_weight_equals_removing(make_problems):
+    """Such pairs may hold any numbers."""
     p = make_problems(n=12, batch=5)
     weights = (torch.arange(12) < 8).double().expand(5, 12)
-    half = pose_covariance(p.pose, *p[:3], img_sigma=2.0, weights=weights)
+    world, sigma = p.world_points.clone(), torch.full((5, 12), 2.0, dtype=torch.float64)
+    world[:, 8:], sigma[:, 8:] = torch.nan, torch.nan
+    half = pose_covariance(p.pose, world, *p[1:3], img_sigma=sigma, weights=weights)
     part = pose_covariance(p.pose, p.world_points[:, :8], p.img_points[:, :8], p.intrinsics, img_sigma=2.0)
     torch.testing.assert_close(half, part)
 
@@ -36,21 +41,21 @@ def test_units_of_the_noise(make_problems):
     torch.testing.assert_close(large, plain * unit * unit[:, None])
 
 
-def test_an_undetermined_pose_has_infinite_variances_and_no_gradient(make_problems):
-    p = make_problems(n=6, batch=3)
-    weights = torch.ones(3, 6, dtype=torch.float64)
-    weights[1, 2:] = 0.0  # two pairs
-    world = p.world_points.clone()
-    world[2] = world[2, :1] + torch.arange(6.0)[:, None] * torch.eye(3)[0]  # one line
-    world.requires_grad_()
-    covariance = pose_covariance(p.pose, world, *p[1:3], img_sigma=1.0, weights=weights)
-    assert covariance[0].isfinite().all()
-    for undetermined in covariance[1:]:
-        assert undetermined.diagonal().isinf().all()
-        assert (undetermined - undetermined.diagonal().diag()).nan_to_num(0.0).eq(0).all()
-    (gradient,) = torch.autograd.grad(covariance[0].sum(), world)
-    assert gradient.isfinite().all()
-    assert not gradient[1:].any()
+@pytest.mark.parametrize("noise", ["sigma", "covariance"])
+def test_an_undetermined_pose_has_infinite_variances_and_no_gradient(noise):
+    """And changes no other covariance."""
+    case = Case("epnp-lm", noise=noise)
+    kinds, sound, bad = make_bad(case)
+    _, pose = make(case, len(sound["weights"]))
+    leaves = [x.requires_grad_() for x in bad.values()]
+    found, expected = pose_covariance(pose, **bad), pose_covariance(pose, **sound)
+    assert torch.equal(found[::2], expected[::2])
+    assert expected.isfinite().all()
+    infinite = torch.diag(torch.full((6,), torch.inf, dtype=torch.float64))
+    assert torch.equal(found[1::2], infinite.expand(len(kinds), 6, 6)), kinds
+    for gradient in torch.autograd.grad(found[::2].sum(), leaves):
+        assert gradient.isfinite().all()
+        assert not gradient[1::2].any()
 
 
 @pytest.mark.parametrize(("n", "outliers"), [(12, 0), (20, 5)])
@@ -59,9 +64,8 @@ def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
     data = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=outliers), dtype=torch.float64)
     p = data.batch(0)
     noise = {"img_sigma": 1.0, "world_sigma": 0.05}
-    with torch.no_grad():
-        result = create_solver("pnpnet-set").double()(*p[:3], **noise)
-        covariance = pose_covariance(result.pose, *p[:3], **noise, weights=result.weights)
+    result = create_solver("pnpnet-set").double()(*p[:3], **noise)
+    covariance = pose_covariance(result.pose, *p[:3], **noise, weights=result.weights)
     error = tangent(result.pose, p.pose)
     for part, freedom, tolerance in ((slice(0, 6), 6.0, 0.06), (slice(0, 3), 3.0, 0.1), (slice(3, 6), 3.0, 0.1)):
         squares = (error[:, part] * torch.linalg.solve(covariance[:, part, part], error[:, part])).sum(-1)
@@ -75,9 +79,8 @@ def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sig
         n=n, batch_size=500, seed=10, img_sigma=img_sigma, world_sigma=world_sigma, dtype=torch.float64
     )
     p = data.batch(0)
-    with torch.no_grad():
-        result = create_solver("pnpnet-set").double()(*p[:3])
-        covariance = result.covariance(*p[:3])
+    result = create_solver("pnpnet-set").double()(*p[:3])
+    covariance = result.covariance(*p[:3])
     error = tangent(result.pose, p.pose)[result.ok]
     squares = (error * torch.linalg.solve(covariance[result.ok], error)).sum(-1)
     assert squares.mean().item() == pytest.approx(6.0, rel=0.33)
@@ -85,30 +88,20 @@ def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sig
     torch.testing.assert_close(alone.covariance(*(x[0] for x in p[:3])), covariance[0])
 
 
-def test_gradients(make_problems):
-    p = make_problems(n=5, batch=2)
-    world, img, camera, pose = p[:4]
-    weights = torch.linspace(0.1, 0.9, 10, dtype=torch.float64).view(2, 5)
-    sigma = torch.full((2, 5), 1.5, dtype=torch.float64)
-    img_cov = torch.diag_embed(torch.tensor([1.0, 2.0], dtype=torch.float64)).expand(2, 5, 2, 2).clone()
+@pytest.mark.parametrize("case", [Case("epnp-lm", noise="sigma"), Case("epnp-lm", noise="covariance", extra="prior")])
+def test_gradients(case):
+    """By all inputs. As in ``laws.gradcheck`` each of them moves relative to its own size."""
+    call, pose = make(case, 1)
+    call |= {"pose": pose, "weights": torch.linspace(0.1, 0.9, PAIRS, dtype=torch.float64)[None]}
+    leaves, spec = pytree.tree_flatten(call)
+    sizes = [x.abs().mean() if x.shape[1:] in ((PAIRS, 2), (PAIRS, 3)) else x for x in leaves]
 
-    def isotropic(translation, world, img, sigma, weights):
-        moved = Pose(pose.rotation, translation)
-        return pose_covariance(moved, world, img, camera, img_sigma=sigma, weights=weights)
+    def run(*changes):
+        moved = [x + size * d for x, size, d in zip(leaves, sizes, changes, strict=True)]
+        return pose_covariance(**pytree.tree_unflatten(moved, spec))
 
-    inputs = [x.clone().requires_grad_() for x in (pose.translation, world, img, sigma, weights)]
-    assert torch.autograd.gradcheck(isotropic, inputs, eps=1e-6, atol=1e-6, rtol=1e-3)
-
-    world_cov = 0.04 * torch.diag_embed(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)).expand(2, 5, 3, 3).clone()
-    information = torch.diag_embed(torch.tensor([1e3, 2e3, 3e3, 4.0, 5.0, 6.0], dtype=torch.float64)).repeat(2, 1, 1)
-
-    def anisotropic(*matrices):
-        img_cov, world_cov, information = (0.5 * (x + x.mT) for x in matrices)
-        prior = PosePrior(pose, information)
-        return pose_covariance(pose, world, img, camera, img_cov=img_cov, world_cov=world_cov, prior=prior)
-
-    inputs = [x.requires_grad_() for x in (img_cov, world_cov, information)]
-    assert torch.autograd.gradcheck(anisotropic, inputs, eps=1e-6, atol=1e-6, rtol=1e-3)
+    changes = [torch.zeros_like(x).requires_grad_() for x in leaves]
+    assert torch.autograd.gradcheck(run, changes, eps=1e-6, atol=1e-6, rtol=1e-3, fast_mode=True)
 
 
 def test_an_unknown_focal_length_is_that_of_the_result(make_problems):

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from kornia.core.exceptions import ShapeError
 
 from kornia_pnpnet import Pose, diagnose
 
@@ -65,8 +64,6 @@ def test_the_mistake_is_named(name, batch):
     (best, *_) = found.best
     assert best.agree == pytest.approx(0.75, abs=0.06)
     assert best.sigma < 1.5
-    assert str(found).startswith(best.change)
-    assert ("as given: " in str(found)[1:]) == (best is not found.trials[0])
 
 
 def test_a_given_pose_is_tried_as_its_inverse():
@@ -82,12 +79,5 @@ def test_random_pairs_have_no_diagnosis():
     points, pixels, _ = problem(outliers=40)
     found = diagnose(points, pixels[torch.randperm(40, generator=torch.Generator().manual_seed(0))], camera())
     assert found.best == ()
-    assert "as given" in str(found)
     invalid = diagnose(points, pixels, torch.zeros(3, 3))
     assert invalid.best == ()
-
-
-def test_bearings_are_refused():
-    points, pixels, _ = problem()
-    with pytest.raises(ShapeError, match="pixels"):
-        diagnose(points, torch.cat((pixels, pixels[:, :1]), -1), camera())

@@ -1,7 +1,6 @@
 """The evidence for a pose: which noise the pairs show, which pairs are inliers, and whether the pose is believed."""
 
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -9,28 +8,27 @@ import torch
 from doubtful import INTRINSICS, doubtful
 from kornia.geometry.linalg import transform_points
 
-from kornia_pnpnet import Pose, create_solver, pose_errors
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet import create_solver, pose_errors
+from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, at_pose, evidence
 from kornia_pnpnet.problem import Noise, Problem, State
 
 ROOT = Path(__file__).parents[1]
 SOLVERS = ("pnpnet-set", "p3p-ransac", "epnp-lm", "pnpnet-n20")
-#: Largest share of the far-off poses that are ``ok``, by kind, and where it is larger: 20 pairs of a wrong convention
-#: often fit an incorrect pose.
-MOST, MOST_OF = 0.05, {"20 pairs": 0.4}
+#: Largest share of the far-off poses that are ``ok``. 20 pairs of a wrong convention often fit an incorrect pose.
+MOST, MOST_OF_20 = 0.05, 0.4
 
 
-def scene(pairs, outliers, sigma, seed=0, batch=50):
-    """A camera at the origin with the focal length 1000 that sees points at depths of 4 to 8."""
-    generator = torch.Generator().manual_seed(seed)
-    pixels = 1000.0 * (torch.rand(batch, pairs, 2, generator=generator, dtype=torch.float64) - 0.5)
-    depth = 4.0 + 4.0 * torch.rand(batch, pairs, 1, generator=generator, dtype=torch.float64)
-    points = torch.cat((pixels / 1000.0, torch.ones_like(depth)), -1) * depth
-    pixels = pixels + sigma * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
-    pixels[:, :outliers] = pixels[:, :outliers].flip(0, 1).roll(1, 0)
-    eye = Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), torch.zeros(batch, 3, dtype=torch.float64))
-    return Problem.of(points, pixels, 1000.0), eye
+def drawn(pairs, outliers, sigma):
+    """Problems of cameras with the focal length 1000."""
+    options = {"field_of_view": (90.0, 90.0), "outlier_share": outliers / pairs, "img_sigma": sigma}
+    return CameraProblems(n=pairs, batch_size=50, seed=0, dtype=torch.float64, **options).batch(0)
+
+
+def scene(pairs, outliers, sigma):
+    """The problems with the principal point 0, and their poses."""
+    p = drawn(pairs, outliers, sigma)
+    return Problem.of(p.world_points, p.img_points - p.intrinsics[:, None, :2, 2], 1000.0), p.pose
 
 
 def found(problem, pose, known=False):
@@ -47,16 +45,15 @@ def test_given_noise_is_kept_unless_the_residuals_contradict():
         assert 1000.0 * result.sigma.median() == pytest.approx(1.0, rel=0.1)
 
 
-def test_evidence_rises_with_pairs_and_falls_with_noise_and_with_an_incorrect_pose():
-    few, many, noisy = (found(*scene(*x)).log_ratio.median() for x in ((10, 2, 0.5), (40, 8, 0.5), (40, 8, 5.0)))
+def test_evidence_rises_with_pairs_and_falls_with_noise_and_with_an_incorrect_pose(perturb):
+    few, many, noisy = (found(*scene(*x)).log_ratio.median() for x in ((10, 2, 1.0), (40, 8, 1.0), (40, 8, 10.0)))
     assert 0.0 < few < noisy < many
-    problem, pose = scene(40, 8, 0.5)
-    turned = Pose.from_rvec(torch.full((50, 3), 0.2, dtype=torch.float64), pose.translation)
-    assert (found(problem, turned).log_ratio < 0).all()
+    problem, pose = scene(40, 8, 1.0)
+    assert (found(problem, perturb(pose, angle=0.35, shift=0.0)).log_ratio < 0).all()
 
 
 def test_copies_share_one_vote():
-    problem, pose = scene(12, 3, 0.5)
+    problem, pose = scene(12, 3, 1.0)
     twice = Problem.of(*(x.repeat(1, 2, 1) for x in problem[:2]), 1000.0)
     votes = Votes.of(twice, twice.weights[:, :1] < 0).pairs
     torch.testing.assert_close(votes.sum(1), torch.full((50,), 12.0, dtype=torch.float64))
@@ -72,29 +69,27 @@ def test_doubtful_poses_are_not_ok_and_right_poses_of_tags_are(name):
         pairs = kind.world_points.shape[1]
         if (name.endswith("n20") and pairs != 20) or (pairs < 4):
             continue
-        with torch.no_grad():
-            result = create_solver(name)(kind.world_points, kind.img_points, INTRINSICS, **kind.given)
+        result = create_solver(name)(kind.world_points, kind.img_points, INTRINSICS, **kind.given)
         turn = torch.full((100,), torch.inf)
         if kind.truth is not None:
             turn = pose_errors(result.pose, kind.truth).rotation_error_deg
-        most = next((value for key, value in MOST_OF.items() if kind.name.startswith(key)), MOST)
+        most = MOST_OF_20 if kind.name.startswith("20 pairs") else MOST
         assert (result.ok & (turn > 10.0)).double().mean() <= most, kind.name
         if kind.name.startswith(("tag of 100", "tag of 400")) and name != "epnp-lm":
             assert result.ok[turn < 2.0].double().mean() >= 0.85, kind.name
             assert result.inliers[turn < 2.0].double().mean() > 0.98, kind.name
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.5, 3.0, 12.0])
+@pytest.mark.parametrize("sigma", [0.1, 1.0, 6.0, 24.0])
 @pytest.mark.parametrize("outliers", [0, 60])
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac"])
 def test_the_noise_and_the_inliers_are_those_of_the_data(name, sigma, outliers):
-    world_points, img_points = scene(100, outliers, sigma)[0][:2]
+    p = drawn(100, outliers, sigma)
     solver = create_solver(name, **({"threshold": 4.0 * sigma} if name == "p3p-ransac" else {}))
-    with torch.no_grad():
-        result = solver(world_points, img_points, torch.diag(torch.tensor([1000.0, 1000.0, 1.0])))
-    assert result.sigma.median() == pytest.approx(sigma, rel=0.1 if sigma < 10.0 else 0.2)
-    assert result.inliers[:, outliers:].double().mean() > 0.98
-    assert not outliers or result.inliers[:, :outliers].double().mean() < 0.1
+    result = solver(*p[:3])
+    assert result.sigma.median() == pytest.approx(sigma, rel=0.1 if sigma < 20.0 else 0.2)
+    assert result.inliers[p.inliers].double().mean() > 0.98
+    assert not outliers or result.inliers[~p.inliers].double().mean() < 0.1
 
 
 @pytest.mark.parametrize("sigmas", [{}, {"img_sigma": 1.0, "world_sigma": 0.05}], ids=["unknown", "given"])
@@ -126,23 +121,17 @@ def test_probability_is_observed_as_often():
     assert near[~sure].double().mean() < near[sure].double().mean() - 0.2
 
 
-def test_a_result_prints_anywhere():
-    p = SyntheticProblems(n=12, batch_size=4, seed=3, outliers=OutlierMix(count=2)).batch(0)
-    solver = create_solver("epnp-lm")
-    with torch.no_grad():
-        many = solver(torch.where(torch.arange(4)[:, None, None] == 1, torch.nan, p.world_points), *p[1:3])
-        single = solver(*(x[0] for x in p[:3]))
-    meta = solver(*(x.to("meta") for x in p[:3]))
-    assert "NOT_FINITE" in repr(many)
-    assert "meta" in repr(meta)
-    assert repr(single)
-    assert repr(many._replace(sigma=None))
+def test_a_result_prints_anywhere(make_problems):
+    p = make_problems()
+    result = create_solver("epnp-lm")(*(x.to("meta") for x in p[:3]))
+    assert repr(result)
+    assert repr(result._replace(sigma=None))
+    single = create_solver("epnp-lm")(*(x[0] for x in p[:3]))
     torch.func.vmap(lambda x: (repr(single._replace(sigma=x)), x)[1])(torch.ones(2))
 
 
 def test_the_law_is_that_of_the_results_file():
     assert list(LAW) == json.loads((ROOT / "docs" / "results" / "probability.json").read_text())["law"]
-    assert math.isfinite(sum(LAW))
 
 
 def test_noise_whose_covariance_has_no_float32_determinant_harms_its_problem_only():

@@ -7,9 +7,9 @@ import torch
 from kornia.core.exceptions import ShapeError
 from kornia.geometry import solve_pnp_dlt
 from kornia.geometry.camera.perspective import project_points
-from kornia.geometry.linalg import inverse_transformation, transform_points
 
 from kornia_pnpnet import PnPNet, Pose, create_solver, pose_covariance, solve_pnp
+from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine.residual import project
 
@@ -95,18 +95,18 @@ def test_rotation_vectors_become_rotations_and_back_with_finite_gradients(angle,
     assert torch.autograd.grad(back.sum(), vector)[0].isfinite().all()
 
 
-@pytest.mark.parametrize("is_rig", [False, True])
-def test_our_projection_is_kornias(is_rig, random_rotations, generator):
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_our_projection_is_kornias(cameras, random_rotations, generator):
     """Cameras with zoom, and rigs, whose pairs have a pose of their own."""
-    points = 2.0 * torch.rand(7, 5, 3, generator=generator, dtype=torch.float64) + torch.tensor([-1.0, -1.0, 4.0])
-    pose = Pose(random_rotations(7), torch.randn(7, 3, generator=generator, dtype=torch.float64))
-    zoom = 0.2 * torch.randn(7, 1, generator=generator, dtype=torch.float64) * (not is_rig)
-    rig = Pose(random_rotations(35, seed=1), torch.randn(35, 3, generator=generator, dtype=torch.float64))
-    in_rig = transform_points(inverse_transformation(rig.matrix), points.view(35, 1, 3)).view(7, 5, 3)
-    world = transform_points(inverse_transformation(pose.matrix), in_rig if is_rig else points)
-    of_pairs = Pose(*(x.unflatten(0, (7, 5)) for x in rig)) if is_rig else None
-    problem = Problem.of(world, torch.zeros(7, 5, 2, dtype=torch.float64), 800.0, rig=of_pairs)
-    found = project(State(pose, zoom), problem).residual.permute(2, 1, 0)
+    p = CameraProblems(n=5, batch_size=7, seed=0, cameras=cameras, dtype=torch.float64).batch(0)
+    if cameras > 1:  # at any turn
+        rig = Pose(random_rotations(35).unflatten(0, (7, 5)), p.cam_from_rig.translation)
+        in_rig = (rig.rotation.mT @ (p.true_cam_points - rig.translation)[..., None])[..., 0]
+        world = (in_rig - p.pose.translation[:, None]) @ p.pose.rotation
+        p = p._replace(world_points=world, cam_from_rig=rig)
+    zoom = 0.2 * torch.randn(7, 1, generator=generator, dtype=torch.float64) * (cameras == 1)
+    problem = Problem.of(p.world_points, torch.zeros_like(p.img_points), 800.0, rig=p.cam_from_rig)
+    found = project(State(p.pose, zoom), problem).residual.permute(2, 1, 0)
     intrinsics = torch.diag_embed(torch.cat((zoom, zoom, 0.0 * zoom), 1).exp() * torch.tensor([800.0, 800.0, 1.0]))
-    expected = project_points(points, intrinsics[:, None].expand(7, 5, 3, 3))
+    expected = project_points(p.true_cam_points, intrinsics[:, None].expand(7, 5, 3, 3))
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)

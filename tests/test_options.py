@@ -71,10 +71,8 @@ def solves(part, values):
 
 def costs(loss, values):
     """The loss of a result is finite."""
-    n9 = PROBLEMS._replace(world_points=PROBLEMS.world_points[:, :9], img_points=PROBLEMS.img_points[:, :9])
-    n9 = n9._replace(inliers=PROBLEMS.inliers[:, :9])
-    result, guess = create_solver("pnpnet-set").with_starts(*n9[:3])
-    finite(loss(result, n9, 1.0, guess) if isinstance(loss, SetLoss) else loss(result, n9))
+    result, guess = create_solver("pnpnet-set").with_starts(*PROBLEMS[:3])
+    finite(loss(result, PROBLEMS, 1.0, guess) if isinstance(loss, SetLoss) else loss(result, PROBLEMS))
 
 
 def is_sound(problems, values):

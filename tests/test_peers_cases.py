@@ -41,8 +41,7 @@ def project(world: Tensor, rotation: Tensor, translation: Tensor, intrinsics: Te
 
 
 def solve(solver: nn.Module, p: Problems, dtype: torch.dtype = torch.float64, **extra) -> PnPResult:
-    with torch.no_grad():
-        result = solver(*(x.to(dtype) for x in p[:3]), **extra)
+    result = solver(*(x.to(dtype) for x in p[:3]), **extra)
     return result._replace(rotation=result.rotation.double(), translation=result.translation.double())
 
 

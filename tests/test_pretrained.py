@@ -15,12 +15,6 @@ from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, read_weights, write_weights
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.results import load_run
 
-
-def solve(solver, problems):
-    with torch.no_grad():
-        return solver(*problems[:3])
-
-
 # Success without outliers and with a random number of outliers: about two points below what the training run found.
 FLOORS = {6: (0.67, 0.53), 9: (0.85, 0.77), 12: (0.92, 0.87), 20: (0.97, 0.95)}
 # Of the one set of weights for any rotation and any number of pairs.
@@ -43,13 +37,13 @@ def test_success_on_problems_that_nothing_else_uses(name, n, floors, dtype):
     )
     solver, sound = create_solver(name), sources[0].batch(0)
     for problems, floor in zip((sound, sources[1].batch(0)), floors, strict=True):
-        assert rate(solve(solver, problems), problems) >= floor
+        assert rate(solver(*problems[:3]), problems) >= floor
     if name != "pnpnet-set":
-        assert rate(solve(create_solver(f"net-n{n}"), sound), sound) < floors[0] / 2
+        assert rate(create_solver(f"net-n{n}")(*sound[:3]), sound) < floors[0] / 2
     few = sound.map(lambda x: x[:400])  # the search for a pose of garbage takes long
     garbage = few._replace(img_points=few.img_points.roll(1, 0))  # every pixel belongs to another problem
-    assert solve(solver, sound).ok.float().mean() > 0.99
-    assert solve(solver, garbage).ok.float().mean() < 0.1
+    assert solver(*sound[:3]).ok.float().mean() > 0.99
+    assert solver(*garbage[:3]).ok.float().mean() < 0.1
 
 
 @pytest.mark.parametrize("name", ["no-such-name", "", "a/b/c"])
@@ -70,8 +64,7 @@ def test_weights_of_the_set_network_are_inlier_probabilities():
     chances, inliers = [], []
     for n in (6, 9, 20, 50):
         problems = SyntheticProblems(n=n, batch_size=2000, seed=555_013 + n, outliers=OutlierMix()).batch(0)
-        with torch.no_grad():
-            chances.append(solver.with_starts(*problems[:3])[1].weights.flatten())
+        chances.append(solver.with_starts(*problems[:3])[1].weights.flatten())
         inliers.append(problems.inliers.flatten())
     chance, truth = torch.cat(chances), torch.cat(inliers)
     assert reliability(chance, truth).expected_error < 0.05
@@ -88,8 +81,6 @@ def test_shipped_weights_have_a_checksum_and_the_card_of_their_run(name, tmp_pat
     for part in ("init", "refine", "normalize"):  # runs recorded options that there are no longer, too
         recorded = results.model[part]
         assert all(recorded[option] == value for option, value in loaded[part].items() if option in recorded)
-    updates = sum(run.run.update for run in results.lineage())
-    assert updates >= (40_000 if name == "pnpnet-set" else 200_000)
     assert sum(path.stat().st_size for path in folder.iterdir()) < 2_000_000
     content = bytearray((folder / "model.safetensors").read_bytes())
     content[-5] ^= 1

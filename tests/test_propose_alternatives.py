@@ -37,8 +37,7 @@ def answers(result):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_right_pose_of_a_board_is_among_them(name, generator):
     *given, pose = boards(generator, sigma=0.7)
-    with torch.no_grad():
-        result = create_solver(name)(*given, alternatives=2)
+    result = create_solver(name)(*given, alternatives=2)
     found, (poses, valid) = result.alternatives, answers(result)
     right = torch.stack([success(pose_errors(x, pose), 15.0, 0.3) for x in poses]) & torch.stack(valid)
     assert right.any(0).double().mean() > max(0.9, right[0].double().mean())
@@ -57,13 +56,12 @@ def test_the_right_pose_of_a_board_is_among_them(name, generator):
 def test_a_pose_is_not_believed_beside_its_mirror_image(generator):
     *given, pose = boards(generator, batch=300, sigma=0.7, dtype=torch.float32)
     believed = {}
-    with torch.no_grad():
-        for effort in ("fixed", "adaptive"):
-            result = create_solver("pnpnet-set", effort=effort)(*given)
-            error = pose_errors(result.pose, pose).rotation_error_deg
-            believed[effort] = result.ok[error > 10.0].double().mean(), result.ok[error < 5.0].double().mean()
-            assert (result.status[~result.ok] != 0).all()
-            assert (result.probability[result.ok] >= LEAST_PROBABILITY).all()
+    for effort in ("fixed", "adaptive"):
+        result = create_solver("pnpnet-set", effort=effort)(*given)
+        error = pose_errors(result.pose, pose).rotation_error_deg
+        believed[effort] = result.ok[error > 10.0].double().mean(), result.ok[error < 5.0].double().mean()
+        assert (result.status[~result.ok] != 0).all()
+        assert (result.probability[result.ok] >= LEAST_PROBABILITY).all()
     assert believed["fixed"][0] > 0.5
     assert believed["adaptive"][0] < 0.5
     assert believed["adaptive"][1] > 0.7
@@ -72,8 +70,7 @@ def test_a_pose_is_not_believed_beside_its_mirror_image(generator):
 def test_a_board_seen_from_the_front(generator):
     """The mirror image is often no minimum; the tilt is then as uncertain as the image says."""
     *given, pose = boards(generator, batch=200, tilt=8.0, sigma=1.0)
-    with torch.no_grad():
-        result = create_solver("pnpnet-set")(*given, img_sigma=1.0, world_sigma=0.0, alternatives=1)
+    result = create_solver("pnpnet-set")(*given, img_sigma=1.0, world_sigma=0.0, alternatives=1)
     poses, (_, valid) = answers(result)
     assert valid.double().mean() > 0.6
     first, other = (pose_errors(x, pose).rotation_error_deg < 8.0 for x in poses)
@@ -89,8 +86,7 @@ def test_the_solutions_of_three_pairs(make_problems):
     problems = make_problems(n=3, batch=50, noise=False)
     plane = (problems.img_points - problems.intrinsics[:, None, :2, 2]) / problems.intrinsics[:, None, [0, 1], [0, 1]]
     every, valid = p3p(problems.world_points, plane)
-    with torch.no_grad():
-        result, other = (create_solver(x)(*problems[:3], alternatives=3) for x in ("pnpnet-set", "p3p-ransac"))
+    result, other = (create_solver(x)(*problems[:3], alternatives=3) for x in ("pnpnet-set", "p3p-ransac"))
     assert (torch.cat((result.status, other.status)) == Status.NOT_BELIEVED).all()
     seen = torch.zeros_like(valid)
     for pose, there in zip(*answers(result), strict=True):
@@ -105,8 +101,7 @@ def test_the_solutions_of_three_pairs(make_problems):
 def test_none_where_the_pairs_say_enough(name, make_problems):
     problems = make_problems(n=50, batch=20)
     solver = create_solver(name, **({"threshold": 20.0} if name == "p3p-ransac" else {}))
-    with torch.no_grad():
-        expected, result = solver(*problems[:3]), solver(*problems[:3], alternatives=3)
+    expected, result = solver(*problems[:3]), solver(*problems[:3], alternatives=3)
     assert expected.alternatives.valid.shape == (20, 0)
     assert not result.alternatives.valid.any()
     assert torch.equal(result.matrix, expected.matrix)
@@ -138,8 +133,7 @@ def test_padding_bad_problems_and_gradients(generator):
 def test_problems_whose_noise_was_underestimated_have_alternatives():
     """Their second solution takes the place of the first one, and the other poses are found for every problem."""
     p = SyntheticProblems(n=30, batch_size=20, seed=5, img_sigma=40.0, world_sigma=0.0).batch(0)
-    with torch.no_grad():
-        solver = create_solver("pnpnet-set")
-        expected, result = solver(*p[:3]), solver(*p[:3], alternatives=2)
+    solver = create_solver("pnpnet-set")
+    expected, result = solver(*p[:3]), solver(*p[:3], alternatives=2)
     assert result.matrix.equal(expected.matrix)
     assert result.alternatives.valid.shape == (20, 2)

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 import torch
-from helpers import assert_same
+from helpers import assert_same, rate
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
@@ -59,11 +59,7 @@ def test_it_learns():
     fresh = SyntheticProblems(n=9, batch_size=1000, seed=2, outliers=OutlierMix(), max_angle=math.pi).batch(0)
     loss, optimizer = SetLoss(), torch.optim.Adam(net.parameters(), lr=4e-3)
 
-    def rate():
-        with torch.no_grad():
-            return success(pose_errors(net(*fresh[:3], **NOISE).pose, fresh.pose)).double().mean().item()
-
-    before = rate()
+    before = rate(net(*fresh[:3], **NOISE), fresh)
     for i in range(100):
         p = data.batch(i)
         optimizer.zero_grad()
@@ -71,7 +67,7 @@ def test_it_learns():
         loss(result, p, 1.0, guess).total.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
-    assert rate() > max(0.65, before + 0.2)
+    assert rate(net(*fresh[:3], **NOISE), fresh) > max(0.65, before + 0.2)
 
 
 def test_padding_costs_nothing(make_problems):
@@ -140,18 +136,18 @@ def test_axis_and_angle_turn_as_kornias_rotation_vectors(dtype):
     angle = 10.0 * torch.randn(400, generator=generator, dtype=torch.float64)
     angle[:200] *= 10.0 ** torch.linspace(-12, 0, 200, dtype=torch.float64)
     upstream = torch.randn(400, 3, 3, generator=generator, dtype=torch.float64).to(dtype)
+
+    def kornias(axis, angle):
+        length = (axis.square().sum(0) + torch.finfo(dtype).eps).sqrt()
+        return axis_angle_to_rotation_matrix((axis / length * angle).mT)
+
     outcomes = []
-    for at in (dtype, torch.float64):
+    for function, at in ((rotation_about, dtype), (kornias, torch.float64)):
         leaves = [x.to(dtype).to(at).requires_grad_() for x in (axis, angle)]
-        if at == dtype:
-            rotation = rotation_about(*leaves)
-        else:
-            floor = torch.finfo(dtype).eps
-            length = (leaves[0].square().sum(0) + floor).sqrt()
-            rotation = axis_angle_to_rotation_matrix((leaves[0] / length * leaves[1]).mT)
+        rotation = function(*leaves)
         by_axis, by_angle = torch.autograd.grad(rotation, leaves, upstream.to(at))
         size = leaves[0].detach().norm(dim=0)  # the gradient by the axis is inverse to it
         outcomes.append([x.to(torch.float64) for x in (rotation, by_axis * size, by_angle)])
     tolerance = 2e-5 if dtype == torch.float32 else 1e-12
-    for mine, kornias in zip(*outcomes, strict=True):
-        torch.testing.assert_close(mine, kornias, rtol=tolerance, atol=20 * tolerance)
+    for mine, expected in zip(*outcomes, strict=True):
+        torch.testing.assert_close(mine, expected, rtol=tolerance, atol=20 * tolerance)

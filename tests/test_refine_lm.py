@@ -142,14 +142,10 @@ def test_gradients_are_finite_from_anywhere(kernel, backward, dtype, make_proble
     for raw, update in itertools.product((-50.0, None, 50.0), UPDATES):
         lm = RobustWeightedLM(5, kernel=kernel, update=update, backward=backward)
         shape = KERNELS[kernel]
-        for parameter, bounds in (
-            (lm.step, (0, 2)),
-            (lm.damping, (1e-8, 1e2)),
-            (lm.robustness, (shape.lower, shape.upper)),
-        ):
-            if raw is not None:  # at the bounds themselves
-                torch.nn.init.constant_(parameter.raw, raw)
-                assert parameter()[0].item() == pytest.approx(bounds[raw > 0], rel=1e-4)
+        bounds = {lm.step: (0, 2), lm.damping: (1e-8, 1e2), lm.robustness: (shape.lower, shape.upper)}
+        for parameter, ends in bounds.items() if raw is not None else ():  # at the bounds themselves
+            torch.nn.init.constant_(parameter.raw, raw)
+            assert parameter()[0].item() == pytest.approx(ends[raw > 0], rel=1e-4)
         leaves = [x.clone().requires_grad_() for x in (*p[:3], *pose)]
         result = PnPNet(None, lm, gradient="always")(*leaves[:3], init=Pose(*leaves[3:]))
         assert all(x.isfinite().all() for x in result[:4])
@@ -206,9 +202,6 @@ def test_memory_of_the_backward_pass(backward, most, make_problems):
     growth = sum(sizes[30]) / sum(sizes[3])
     assert growth <= most
     assert most == 1.0 or growth > 5.0
-
-
-# --- hyperparameters -----------------------------------------------------------------------------------------------
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Pose
 from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine import residual
 from kornia_pnpnet.refine.residual import normal_equations, project, retract
@@ -16,24 +17,18 @@ from kornia_pnpnet.refine.residual import normal_equations, project, retract
 FOCAL, RADIAL = 3400.0, torch.tensor([[0.05, -0.02]], dtype=torch.float64)
 
 
-def scene(camera, unknown, rotation, batch=7, n=9):
-    """Points in front of cameras but for one, pixels 50 px off, and a state with unknown parameters of the camera."""
-    generator = torch.Generator().manual_seed(0)
-
-    def uniform(*shape):
-        return 2.0 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1.0
-
-    points = uniform(batch, n, 3) * torch.tensor([10.0, 10.0, 40.0]) + torch.tensor([0.0, 0.0, 50.0])
-    pixels = FOCAL * points[..., :2] / points[..., 2:] + 50.0 * uniform(batch, n, 2)
-    points[0, 0, 2] = -20.0
-    pose, rig = Pose(rotation, 12.5 * uniform(batch, 3)), None
-    if camera != "pixels":
-        turn = axis_angle_to_rotation_matrix(uniform(batch * n, 3)).unflatten(0, (batch, n))
-        rig = Pose(turn, uniform(batch, n, 3) * (camera == "rig"))
-        points = ((points - rig.translation)[..., None, :] @ turn)[..., 0, :]
-    world = (points - pose.translation[:, None]) @ pose.rotation
-    known = torch.cat((0.1 * uniform(batch, 1), RADIAL.expand(batch, 2)), 1)[:, :unknown]
-    return State(pose, known), Problem.of(world, pixels, FOCAL, rig=rig)
+def scene(camera, unknown, turn):
+    """Points in front of cameras but for one, and a state with unknown parameters of the camera."""
+    options = {"cameras": 1 if camera == "pixels" else 3, "baseline": 0.1 if camera == "rig" else 0.0}
+    p = CameraProblems(n=9, batch_size=7, seed=0, dtype=torch.float64, **options).batch(0)
+    if p.cam_from_rig is not None:  # whose cameras turn about one axis
+        rig = p.cam_from_rig._replace(rotation=p.cam_from_rig.rotation @ turn.mT[:, None])
+        pose = Pose(turn @ p.pose.rotation, (turn @ p.pose.translation[..., None])[..., 0])
+        p = p._replace(pose=pose, cam_from_rig=rig)
+    to_camera = p.pose.rotation if p.cam_from_rig is None else p.cam_from_rig.rotation[:, 0] @ p.pose.rotation
+    p.world_points[0, 0] -= 1000.0 * to_camera[0, 2]  # to the far side of the camera
+    known = torch.cat((torch.linspace(-0.1, 0.1, 7).double()[:, None], RADIAL.expand(7, 2)), 1)[:, :unknown]
+    return State(p.pose, known), Problem.of(p.world_points, p.img_points - 1000.0, FOCAL, rig=p.cam_from_rig)
 
 
 @pytest.mark.parametrize("few", [True, False])

@@ -120,8 +120,7 @@ def test_a_camera_term_is_linearised(unknown, state):
 def test_pose_is_a_minimum_of_the_whole_cost(kind, make_problems, generator):
     p = make_problems(n=8, batch=20)
     prior = kind(p, generator)._replace(scale=torch.full((20,), torch.inf, dtype=torch.float64))
-    with torch.no_grad():
-        state = State.of(refiner(40)(*p[:3], prior=prior, init=p.pose, img_sigma=2.0).pose)
+    state = State.of(refiner(40)(*p[:3], prior=prior, init=p.pose, img_sigma=2.0).pose)
     problem = Problem.of(p.world_points, p.img_points, p.intrinsics[0, 0, 0])
     term, _ = PoseTerm.of(prior, torch.zeros(20, 3).double(), torch.ones(20).double())
 
@@ -159,8 +158,7 @@ def test_what_is_known_helps_and_what_is_wrong_hardly_harms(make_problems, gener
     nine = make_problems(n=9, batch=500, outliers=3)
 
     def found(problems, prior=None):
-        with torch.no_grad():
-            return rate(solver(*problems[:3], prior=prior, **SIGMAS), problems)
+        return rate(solver(*problems[:3], prior=prior, **SIGMAS), problems)
 
     assert found(three, drawn(three, generator)) > found(three) + 0.15
     alone = found(nine)
@@ -177,8 +175,7 @@ def test_gravity_chooses_among_poses(name, options, make_problems, generator):
     """Of four pairs with one outlier, three decide: gravity tells their poses apart."""
     problems = make_problems(n=4, batch=500, outliers=1)
     solver = create_solver(name, **options)
-    with torch.no_grad():
-        found = [solver(*problems[:3], prior=x, **SIGMAS) for x in (None, gravity(problems, generator))]
+    found = [solver(*problems[:3], prior=x, **SIGMAS) for x in (None, gravity(problems, generator))]
     assert rate(found[1], problems) > rate(found[0], problems) + 0.02
 
 

@@ -34,14 +34,6 @@ def test_no_results_file_is_older_than_one_change_of_behaviour():
     assert [name for name, x in made.items() if BEHAVIOUR - x.get("behaviour", 0) > 1] == []
 
 
-def test_a_block_stands_between_its_lines():
-    text = f"before\n{render.BEGIN}\nold\n{render.END}\nafter\n"
-    replaced = render.with_block(text, "new")
-    assert replaced == render.with_block(replaced, "new") == text.replace("old", "new")
-    with pytest.raises(ValueError, match="overview:begin"):
-        render.with_block("before", "new")
-
-
 def test_kinds_of_matches_are_summed_by_the_number_of_problems():
     solvers = {
         "pnpnet-set": (90, 80, 2.0),

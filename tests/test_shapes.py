@@ -7,22 +7,28 @@ from kornia.core.exceptions import BaseError
 from kornia_pnpnet import (
     Pose,
     depth_points,
+    diagnose,
     gravity_prior,
     heatmap_keypoints,
     monte_carlo_pose_loss,
+    pose_covariance,
     pose_errors,
     success,
 )
 from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.losses import pose_distances
 
-CAMERA, PIXELS = torch.eye(3), torch.zeros(2, 5, 2)
+CAMERA, PIXELS, POINTS = torch.eye(3), torch.zeros(2, 5, 2), torch.ones(2, 5, 3)
 POSES = Pose(CAMERA.expand(2, 3, 3), torch.zeros(2, 3))
 ERRORS = pose_errors(POSES, POSES)
 
 
+def covariance(**noise):
+    return pose_covariance(POSES, POINTS, PIXELS, CAMERA, **noise)
+
+
 def likelihood(*given, **options):
-    given = given or (POSES, POSES, torch.ones(2, 5, 3), PIXELS, CAMERA)
+    given = given or (POSES, POSES, POINTS, PIXELS, CAMERA)
     return monte_carlo_pose_loss(*given, img_sigma=1.0, **options)
 
 
@@ -55,6 +61,11 @@ WRONG = {
     "kernel": lambda: likelihood(kernel="wide"),
     "few samples": lambda: likelihood(samples=3),
     "true poses": lambda: likelihood(POSES, POSES, torch.ones(3, 5, 3), torch.zeros(3, 5, 2), CAMERA),
+    "both kinds of pixel noise": lambda: likelihood(img_cov=torch.zeros(2, 5, 2, 2)),
+    "both kinds of point noise": lambda: covariance(img_sigma=1.0, world_sigma=0.1, world_cov=torch.zeros(2, 5, 3, 3)),
+    "no noise of a covariance": lambda: covariance(world_sigma=0.1),
+    "no noise of a loss": lambda: monte_carlo_pose_loss(POSES, POSES, POINTS, PIXELS, CAMERA),
+    "bearings": lambda: diagnose(POINTS, POINTS, CAMERA),
     "matrices": lambda: POSES.camera(CAMERA.expand(3, 3, 3)),
 }
 
