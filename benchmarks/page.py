@@ -45,37 +45,6 @@ def is_whole(name: str) -> bool:
     return name.partition(" ")[0] in (TRAINED, ANY)
 
 
-def compiling_pays(alone: Rows, many: Rows, batch: int, first_calls: Mapping[tuple[str, str], float]) -> list[str]:
-    """For each solver, its speedup by compiling, and the number of problems that pay for the compiler."""
-    found = []
-    for name in (TRAINED, ANY):
-        compiled = f"{name} compiled"
-        seconds = first_calls.get((compiled, COLD))
-        if seconds is None or not all(key in rows for key in (name, compiled) for rows in (alone, many)):
-            continue
-        parts = []
-        for rows, what in ((many, f"in batches of {batch}"), (alone, "one at a time")):
-            slow, fast = rows[name]["median_us"], rows[compiled]["median_us"]
-            count = 1e6 * seconds / (slow - fast) if fast < slow else 0.0
-            step = 10 ** max(0, len(f"{count:.0f}") - 2)  # two digits
-            pays = f"pays after {round(count / step) * step:,} problems" if count else "never pays"
-            parts.append(f"{slow / fast:.1f} times as fast {what} ({pays})")
-        found.append(f"`{name}` compiled is {' and '.join(parts)}.")
-    return found
-
-
-def leaders(alone: Rows, many: Rows) -> list[str]:
-    """For one problem and for batches, the fastest of ours and of the other libraries."""
-    found = []
-    for what, rows in (("One problem at a time", alone), ("Batches", many)):
-        us = {name: row["median_us"] for name, row in rows.items()}
-        sides = [*filter(is_whole, rows)], [name for name in PEERS if name in rows]
-        if all(sides):
-            fast, slow = sorted((min(side, key=us.__getitem__) for side in sides), key=us.__getitem__)
-            found.append(f"{what}: `{fast}` is fastest, {us[slow] / us[fast]:.1f} times as fast as `{slow}`.")
-    return found
-
-
 def memory(starts: Iterable[Row]) -> dict[str, dict[bool, float]]:
     """How many MiB calls add to the peak of a process, by contender, without and with gradients."""
     found: dict[str, dict[bool, float]] = {}
@@ -148,9 +117,8 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         settings=settings,
         **{"alone": alone, "two": matching(latency, threads=2), "many": many},
         first_calls=first_calls,
-        pays=compiling_pays(alone, many, settings["problems"], first_calls),
-        libraries=[*filter(is_whole, alone), *(peer for peer in PEERS if peer in alone)],
-        leaders=leaders(alone, many),
+        ours=[*filter(is_whole, alone)],
+        peers=[name for name in PEERS if name in alone],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         memory=memory(starts),
         gpu=gpu_section(gpu),

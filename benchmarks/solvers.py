@@ -78,14 +78,6 @@ def base_name(spec: str) -> str:
     return spec.partition(":")[0]
 
 
-def memory_here(spec: str, count: int) -> dict[str, int]:
-    """Solve one large batch in this process; the peak memory before and after."""
-    before = harness.peak_bytes()
-    with harness.threads(), torch.no_grad():
-        load_solver(spec)(*draw(MEMORY_SET, count)[:3])
-    return {"imports_bytes": before, "peak_bytes": harness.peak_bytes()}
-
-
 def measure_memory(spec: str, count: int) -> dict[str, Any]:
     """Solve one large batch in several processes, and find the largest peak.
 
@@ -148,7 +140,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.count < 1 or options.repeats < 1 or options.memory_count < 0:
         command.error("--count and --repeats must be at least 1, --memory-count at least 0")
     if options.memory_of:
-        print(json.dumps(memory_here(options.memory_of, options.memory_count)))
+        before = harness.peak_bytes()
+        with harness.threads(), torch.no_grad():
+            load_solver(options.memory_of)(*draw(MEMORY_SET, options.memory_count)[:3])
+        print(json.dumps({"imports_bytes": before, "peak_bytes": harness.peak_bytes()}))
         return
     given = {"count": options.count, "repeats": options.repeats}
     try:
