@@ -45,52 +45,16 @@ def is_whole(name: str) -> bool:
     return name.partition(" ")[0] in (TRAINED, ANY)
 
 
-def memory(starts: Iterable[Row]) -> dict[str, dict[bool, float]]:
-    """How many MiB calls add to the peak of a process, by contender, without and with gradients."""
-    found: dict[str, dict[bool, float]] = {}
-    for entry in starts:
-        if entry["memory"]:
-            added = entry["memory"]["peak_bytes"] - entry["memory"]["before_bytes"]
-            found.setdefault(entry["contender"], {})[entry["backward"]] = added / 2**20
-    return found
-
-
-def gpu_section(results: Row | None) -> dict[str, Any] | None:
-    """Facts of the section on a GPU, from the file of ``gpu.py``."""
-    if results is None:
-        return None
-    part = results["throughput"]
-    rows = [row for row in part["rows"] if "median_us" in row]
-    loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
-    groups = figures.grouped((row for row in rows if "work" in row), "contender", "n", "mode")
-    lines = []
-    for group in groups.values():
+def quickest(results: Row) -> list[dict[str, Any]]:
+    """The quickest batch of each contender on a GPU, with the times of all batches and the time of PoseLib."""
+    rows = [row for row in results["throughput"]["rows"] if "median_us" in row]
+    loops = {row["n"]: row["median_us"] for row in rows if row["contender"] == "poselib"}
+    found = []
+    for group in figures.grouped((row for row in rows if "work" in row), "contender", "n", "mode").values():
         best = min(group, key=lambda row: row["median_us"])
-        faster = f"{loops[best['n']]['median_us'] / best['median_us']:.0f}"
-        lines.append({**best, "us": {row["batch"]: row["median_us"] for row in group}, "faster": faster})
-    complete = [x for x in results["parity"]["rows"] if None not in (x.get("same_pose"), x.get("same_gradient"))]
-    return {
-        "made": part["environment"],
-        "poselib_us": loops[N]["median_us"],
-        "count": results["parity"]["settings"]["parity"],
-        "batches": part["settings"]["batches"],
-        "throughput": lines,
-        "graphs": results["graphs"]["rows"],
-        "modes": results["graphs"]["settings"]["modes"],
-        "waits": results["waits"]["rows"],
-        "parity": complete,
-    }
-
-
-def skipped_reasons(results: Rows) -> list[str]:
-    """Why a row is missing, each reason once."""
-    found: dict[str, None] = {}
-    for part in PARTS:
-        for entry in results[part]["skipped"]:
-            place = ", ".join(f"{key} = {entry[key]}" for key in ("n", "batch") if key in entry)
-            mode = f", {entry['mode']}" if entry.get("mode") == BACKWARD else ""
-            found[f"`{entry['contender']}`{f' at {place}' if place else ''}{mode}: {entry['why']}."] = None
-    return list(found)
+        us = {row["batch"]: row["median_us"] for row in group}
+        found.append({**best, "us": us, "loop_us": loops[best["n"]]})
+    return found
 
 
 def page(results: Rows, gpu: Row | None = None) -> str:
@@ -120,9 +84,8 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         ours=[*filter(is_whole, alone)],
         peers=[name for name in PEERS if name in alone],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
-        memory=memory(starts),
-        gpu=gpu_section(gpu),
-        skipped=skipped_reasons(results),
+        gpu=gpu,
+        quickest=quickest(gpu) if gpu else [],
     )
 
 

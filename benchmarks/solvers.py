@@ -73,11 +73,6 @@ def measure_set(solvers: Mapping[str, nn.Module], name: str, count: int, repeats
     ]
 
 
-def base_name(spec: str) -> str:
-    """The name of a solver without its options."""
-    return spec.partition(":")[0]
-
-
 def measure_memory(spec: str, count: int) -> dict[str, Any]:
     """Solve one large batch in several processes, and find the largest peak.
 
@@ -101,13 +96,14 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
         except ImportError as error:
             skipped[spec] = str(error)
             harness.say(f"skipped: {spec}: {error}")
-    wanted = [spec for spec in solvers if memory_count and base_name(spec) == MEMORY_SOLVER]
+    name_of = {spec: spec.partition(":")[0] for spec in solvers}
+    wanted = [spec for spec, name in name_of.items() if memory_count and name == MEMORY_SOLVER]
     memory = [measure_memory(spec, memory_count) for spec in wanted]
     rows = []
     with harness.threads():
         for name, (n, *_) in SETS.items():
             harness.say(name)
-            chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or base_name(spec) in ROBUST}
+            chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or name_of[spec] in ROBUST}
             rows += measure_set(chosen, name, count, repeats)
     return {"skipped": skipped, "rows": rows, "memory": memory}
 

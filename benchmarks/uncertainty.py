@@ -18,21 +18,13 @@ import torch
 from harness import share
 from torch import Tensor, nn
 
-from kornia_pnpnet import (
-    PnPNet,
-    PosePrior,
-    RobustWeightedLM,
-    create_solver,
-    gravity_prior,
-    pose_covariance,
-    pose_errors,
-)
+from kornia_pnpnet import PnPNet, PosePrior, RobustWeightedLM, create_solver, gravity_prior, pose_covariance
 from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.points import BoxPoints
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.metrics import success
+from kornia_pnpnet.metrics import pose_errors, success
 from kornia_pnpnet.refine.residual import retract, tangent
 from kornia_pnpnet.result import PnPResult, Pose, Problems
 

@@ -110,9 +110,7 @@ def plot(runs: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    parser = command(__doc__)
-    parser.add_argument("--steps", type=int, default=600)
-    options = parser.parse_args()
+    options = command(__doc__, steps=600).parse_args()
     torch.set_num_threads(1)
     runs = {name: learn(solve, options.steps) for name, solve in SOLVERS.items()}
     write(options.out / "keypoint_offsets.json", steps=options.steps, runs=runs)

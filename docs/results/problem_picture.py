@@ -1,6 +1,6 @@
 """The picture of the home page: a house, the pairs that ``pnpnet-set`` rejects, and the pose that it finds.
 
-``house.jpg`` shows the house from the pose below; the ray tracer of commit ccb8600 (``docs/results/house.py``) rendered it.
+``house.jpg`` shows the house from the pose below. ``docs/results/house.py`` of commit ccb8600 rendered it.
 """
 
 import itertools
