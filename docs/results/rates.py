@@ -3,17 +3,12 @@
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise, takewhile
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from figures import mix_in_words
 from measure import BOUNDS, HERE
-
-
-def interval(rate: float, low: float, high: float) -> str:
-    """A rate with its interval."""
-    return f"{rate:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def shown(data: str) -> str:
@@ -51,19 +46,10 @@ class Rates:
         rates = [self.rate(data, solver) for data in self.sets if data.endswith(ending)]
         return sum(rates) / len(rates)
 
-    def time(self, data: str, solver: str) -> float:
-        """Microseconds per problem."""
-        return float(self.rows[data, solver]["us_per_problem"])
-
     def difference(self, data: str, one: str, other: str) -> tuple[float, bool]:
         """Difference of two solvers in points, and whether their intervals are apart."""
         a, b = (self.rows[data, name]["success"] for name in (one, other))
         return 100 * (a["rate"] - b["rate"]), a["low"] > b["high"] or b["low"] > a["high"]
-
-    def versus(self, data: str, one: str, other: str) -> str:
-        """The difference of two solvers in words."""
-        points, apart = self.difference(data, one, other)
-        return f"{points:+.1f} points ({('ahead' if points > 0 else 'behind') if apart else 'intervals overlap'})"
 
     def best(self, data: str, solvers: Iterable[str]) -> str:
         """The solver with the highest success."""
@@ -73,10 +59,6 @@ class Rates:
         """The largest half-width of an interval, in points."""
         found = [row["success"] for (data, _), row in self.rows.items() if data in (sets or self.sets)]
         return 100 * max(max(one["rate"] - one["low"], one["high"] - one["rate"]) for one in found)
-
-    def cell(self, data: str, solver: str) -> str:
-        """Success in per cent for a table, a dash where the solver did not solve the set."""
-        return f"{self.rate(data, solver):.1f}" if (data, solver) in self.rows else "–"
 
     def first(self, data: str, solver: str) -> bool:
         """Whether no other solver solves more of a set, bounds aside."""
@@ -174,34 +156,10 @@ def ablation(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def sweep(rows: Sequence[Row]) -> dict[str, Any]:
-    """Facts of the sweep: a table of n and mix against m, and the steps in m and in n at the middle of the other."""
+    """Facts of the sweep: runs by n, m and mix, least times over the mixes, and the middle n and m."""
     runs = {(int(row["model.n"]), int(row["model.m"]), float(row["data.outliers.max_ratio"])): row for row in rows}
     all_n, all_m, mixes = (sorted(set(values)) for values in zip(*runs, strict=True))
     times = {(n, m): min(float(runs[n, m, mix]["us_per_problem"]) for mix in mixes) for n in all_n for m in all_m}
-    n, m = all_n[len(all_n) // 2], all_m[len(all_m) // 2]
-
-    def steps(found: Mapping[int, Row]) -> str:
-        return ", ".join(
-            f"{low} → {high} {compared([found[high]], [found[low]], 'uniform')}" for low, high in pairwise(found)
-        )
-
-    findings = [
-        f"{mix_in_words(mix)}: m at n = {n}, {steps({x: runs[n, x, mix] for x in all_m})}; "
-        f"n at m = {m}, {steps({x: runs[x, m, mix] for x in all_n})}."
-        for mix in mixes
-    ]
+    middle = {"middle_n": all_n[len(all_n) // 2], "middle_m": all_m[len(all_m) // 2]}
     axes = {"n": all_n, "m": all_m, "mixes": {mix: mix_in_words(mix) for mix in mixes}}
-    return {"updates": rows[0]["update"], "runs": runs, "times": times, **axes, "findings": findings}
-
-
-def capacity(rows: Sequence[Row], shipped: str) -> dict[str, Any]:
-    """Facts of the sizes of the set network: a table, and how each size differs from the ``shipped`` one."""
-    sets = validation_sets(rows)
-    recipe = [row for row in rows if row["run"] == shipped]
-    findings = []
-    for row in rows:
-        found = {data: compared([row], recipe, data) for data in sets}
-        apart = ", ".join(f"{data} {text}" for data, text in found.items() if "overlap" not in text)
-        if row not in recipe:
-            findings.append(f"`{row['run']}`: {apart or 'all intervals overlap'}.")
-    return {"updates": rows[0]["update"], "claim": claim("capacity"), "sets": sets, "runs": rows, "findings": findings}
+    return {"updates": rows[0]["update"], "runs": runs, "times": times, **axes, **middle}
