@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from harness import Row, pivot, recorded, say, share, threads
-from kornia.core.exceptions import BaseError
 from kornia.geometry import epipolar
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -542,10 +541,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32", "told": KNOWN_SIGMAS}
         settings |= {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
         run = partial(measure, matches, options.solvers, options.pictures, options.batch)
-    try:
-        results = recorded(run, **settings)
-    except BaseError as error:
-        command.error(str(error))
+    results = recorded(run, **settings)
     if options.command == "measure":
         print(format_results(results))
     save_results(results, options.out)
