@@ -35,11 +35,6 @@ def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
     return {row["contender"]: row for row in rows if wanted.items() <= row.items()}
 
 
-def successes(row: Row) -> str:
-    """Success in per cent with its interval."""
-    return str(SuccessRate(**row["success"])).replace(" %", "")
-
-
 def is_whole(name: str) -> bool:
     """Whether a contender is a solver of ours that users call, as shipped, in any way."""
     return name.partition(" ")[0] in (TRAINED, ANY)
@@ -73,8 +68,9 @@ def page(results: Rows, gpu: Row | None = None) -> str:
     return harness.render(
         "performance.md.jinja",
         **{"trained": TRAINED, "plain": PLAIN, "any": ANY, "n": N, "m": ITERATIONS},
-        **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT, "successes": successes, "at": at},
+        **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT, "at": at},
         **{"cold": COLD, "cached": CACHED, "eager": EAGER, "forward": FORWARD, "backward": BACKWARD},
+        successes=lambda row: str(SuccessRate(**row["success"])).replace(" %", ""),
         shipped={"m": shipped.refine.m, "views": shipped.views},
         made=throughput["environment"],
         results=results,

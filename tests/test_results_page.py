@@ -74,8 +74,8 @@ def test_a_solver_is_ahead_or_behind_only_when_intervals_are_apart():
     rows = [entry(data, name, rate) for data, pair in shares.items() for name, rate in zip("ab", pair, strict=True)]
     rates = Rates({"rows": rows, "data": list(shares), "solvers": ["a", "b"]})
     standing = compare_all([rates], "a", ["b"])
-    assert (standing.ahead, standing.overlapping) == (["won"], ["even"])
-    assert standing.behind == {"lost": ("b", pytest.approx(10.0))}
+    assert [list(sets) for sets in standing.values()] == [["won"], ["even"], ["lost"]]
+    assert standing["behind"] == {"lost": ("b", pytest.approx(10.0))}
     assert rates.best("lost", ["a", "b"]) == "b"
 
 

@@ -5,9 +5,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from figures import mix_in_words
+from figures import grouped, mix_in_words
 from measure import BOUNDS, HERE
 
 
@@ -16,17 +16,6 @@ def shown(data: str) -> str:
     short = data.replace("synthetic, ", "").replace("any_rotation", "any rotation").replace("_", " ")
     short = short.replace("+0 outliers (raw matches)", "raw matches")
     return re.sub(r"(\d)-(\d)", r"\1–\2", short)
-
-
-class Standing(NamedTuple):
-    """Sets by how a solver compares with the best other one: their intervals are apart, or overlap.
-
-    ``behind`` has by set the best other solver, and its lead in points.
-    """
-
-    ahead: list[str]
-    behind: dict[str, tuple[str, float]]
-    overlapping: list[str]
 
 
 class Rates:
@@ -72,20 +61,20 @@ class Rates:
         return shown(start), [shown(data.removeprefix(f"{start}, ")) for data in self.sets]
 
 
-def compare_all(files: Iterable[Rates], solver: str, others: Sequence[str]) -> Standing:
-    """A solver beside the best of the others, on every set of some results files."""
-    standing = Standing([], {}, [])
+def compare_all(files: Iterable[Rates], solver: str, others: Sequence[str]) -> dict[str, dict[str, tuple[str, float]]]:
+    """All sets of some results files by how a solver compares with the best of the others.
+
+    The solver is ``ahead`` or ``behind`` where the intervals are apart; elsewhere they are ``overlapping``. Each set
+    has the best other solver, and its lead in points.
+    """
+    found: dict[str, dict[str, tuple[str, float]]] = {"ahead": {}, "overlapping": {}, "behind": {}}
     for rates in files:
         for data in rates.sets:
             best = rates.best(data, others)
-            points, apart = rates.difference(data, solver, best)
-            if not apart:
-                standing.overlapping.append(data)
-            elif points > 0:
-                standing.ahead.append(data)
-            else:
-                standing.behind[data] = best, -points
-    return standing
+            lead, apart = rates.difference(data, best, solver)
+            verdict = "overlapping" if not apart else "behind" if lead > 0 else "ahead"
+            found[verdict][data] = best, lead
+    return found
 
 
 EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
@@ -133,12 +122,9 @@ def ablation(rows: Sequence[Row]) -> dict[str, Any]:
     sets = validation_sets(rows)
     recipe = [row for row in rows if row["experiment"] == "recipe"]
     others = [row for row in rows if row not in recipe]
-    kinds: dict[tuple[str, str], list[Row]] = {}
-    for row in others:
-        kinds.setdefault((row["experiment"], row.get(KERNEL, "")), []).append(row)
     findings: dict[str, dict[str, str]] = {}
     verdicts: dict[str, list[str]] = {"Higher success": [], "Lower success": [], "No difference seen": []}
-    for (experiment, kind), runs in kinds.items():
+    for (experiment, kind), runs in grouped(others, "experiment", KERNEL).items():
         found = ", ".join(f"{data} {compared(runs, recipe, data)}" for data in sets)
         verdict = "Lower success" if "(below)" in found else "Higher success" if "(above)" in found else None
         verdicts[verdict or "No difference seen"].append(f"`{f'{experiment} {kind}'.strip()}`")

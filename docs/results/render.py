@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,24 +47,12 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, An
     return dict(sorted(found.items(), key=lambda x: (x[0] != ANY, -x[1][0]["success"]["rate"])))
 
 
-def rigs(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Least success on rigs and the range of times as fast as PoseLib."""
-    by_solver = grouped(rows, "solver")
-    ours, theirs = by_solver[ANY], by_solver["PoseLib"]
-    ratios = [y["us"] / x["us"] for x, y in zip(ours, theirs, strict=True)]
-    return {
-        "slowest": min(ratios),
-        "fastest": max(ratios),
-        "least": 100 * min(x["success"] for x in ours),
-        "least_poselib": 100 * min(x["success"] for x in theirs),
-    }
-
-
 def page(overview: str) -> str:
     """The results page as Markdown, with an overview of real matches."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
     complexity, runs = load("complexity"), {name: rates.read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
     benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
+    rigs = grouped(cameras["rigs"], "solver")
     at_nine = complexity["n"].index(9)
     any_network: Any = PnPNet.from_pretrained(ANY).init
     files = {name: rates.Rates(entry) for name, entry in results.items()}
@@ -75,7 +63,6 @@ def page(overview: str) -> str:
         any=ANY,
         shipped_views=PnPNet.from_pretrained(OURS).views,
         made=results["paper"]["environment"],
-        commits={name: f"{entry['environment']['commit']:.9}" for name, entry in results.items()},
         results=results,
         operations={name: counts[at_nine] for name, counts in complexity["counts"].items()},
         overview=overview,
@@ -84,7 +71,8 @@ def page(overview: str) -> str:
         accuracy_set=ACCURACY_SET,
         benchmark=benchmark,
         unknown_focal=grouped(cameras["real"], "solver"),
-        rigs=rigs(cameras["rigs"]),
+        rigs=rigs,
+        rig_ratios=[other["us"] / own["us"] for own, other in zip(rigs[ANY], rigs["PoseLib"], strict=True)],
         beside_robust=rates.compare_all((files["set"], files["set_real"]), ANY, ROBUST),
         beside_peers=rates.compare_all((files["set"], files["set_real"]), ANY, PEERS),
         ours_beside_peers=rates.compare_all((files["paper"], files["gaussian_pose"], files["real"]), OURS, PEERS),
