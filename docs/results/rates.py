@@ -44,9 +44,9 @@ class Rates:
         """The solver with the highest success."""
         return max((name for name in solvers if (data, name) in self.rows), key=lambda name: self.rate(data, name))
 
-    def reach(self, sets: Sequence[str] | None = None) -> float:
+    def reach(self) -> float:
         """The largest half-width of an interval, in points."""
-        found = [row["success"] for (data, _), row in self.rows.items() if data in (sets or self.sets)]
+        found = [row["success"] for row in self.rows.values()]
         return 100 * max(max(one["rate"] - one["low"], one["high"] - one["rate"]) for one in found)
 
     def first(self, data: str, solver: str) -> bool:
