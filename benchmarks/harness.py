@@ -117,7 +117,7 @@ def render(template: str, **facts: Any) -> str:
     """A page from its template, with the filters below. Missing facts are errors."""
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
-    environment.filters |= {"percent": percent, "digits": three_digits, "two_digits": two_digits, "foot": foot}
+    environment.filters |= {"percent": percent, "digits": three_digits, "foot": foot}
     return environment.get_template(template).render(**facts)
 
 
@@ -162,11 +162,6 @@ def foot(made: Row) -> str:
 def percent(value: float | None, digits: int = 1) -> str:
     """A share in per cent, without the sign."""
     return "–" if value is None else f"{100 * value:.{digits}f}"
-
-
-def two_digits(count: int) -> str:
-    """Two significant digits of a whole number."""
-    return f"{float(f'{count:.1e}'):,.0f}"
 
 
 def three_digits(value: float) -> str:

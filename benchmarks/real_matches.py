@@ -60,13 +60,11 @@ SHARES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 1.0)
 KINDS = ("ratio test", "no ratio test")
 RATIO_TEST = 0.8  # Lowe's value
 BATCH = 500
-# Keypoints of an image; the n-th of n images is a query; images of the map for each query; most pairs of a problem; and
-# the seed of the subsets of pairs.
-FEATURES = 2000
-EVERY = 4
-VIEWS = 6
-MOST_PAIRS = 500
-SEED = 0
+FEATURES = 2000  # keypoints of an image
+EVERY = 4  # every fourth image is a query
+VIEWS = 6  # images of the map for each query
+MOST_PAIRS = 500  # of a problem
+SEED = 0  # of the subsets of pairs
 # Points of the map: largest distance to the epipolar line and largest reprojection error in an image of the map, in
 # pixels; smallest angle between two of the rays, in degrees.
 EPIPOLAR_PX, TRIANGULATION_PX, MIN_ANGLE = 2.0, 2.0, 1.5

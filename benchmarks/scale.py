@@ -113,15 +113,16 @@ def compare(expected: dict[str, np.ndarray], folder: Path) -> dict[str, int]:
     """Counts of problems that are lost, twice there, or have another result."""
     found = read(folder)
     ids, first = np.unique(found["id"], return_index=True)
-    lost = len(expected["id"]) - len(ids)
-    counts = {"lost": lost, "twice": len(found["id"]) - len(ids)}
     at = np.searchsorted(expected["id"], ids)
-    apart = [np.abs(found[name][first] - expected[name][at]).max(1) for name in POSE]
-    both = found["ok"][first] & expected["ok"][at]
-    counts["other_ok"] = int((found["ok"][first] != expected["ok"][at]).sum())
-    counts["same_bits"] = int((np.maximum(*apart) == 0).sum())
-    counts["beyond_rounding"] = int((both & (np.maximum(*apart) > ROUNDING)).sum())
-    return counts
+    apart = np.maximum(*(np.abs(found[name][first] - expected[name][at]).max(1) for name in POSE))
+    ok, expected_ok = found["ok"][first], expected["ok"][at]
+    return {
+        "lost": len(expected["id"]) - len(ids),
+        "twice": len(found["id"]) - len(ids),
+        "other_ok": int((ok != expected_ok).sum()),
+        "same_bits": int((apart == 0).sum()),
+        "beyond_rounding": int((ok & expected_ok & (apart > ROUNDING)).sum()),
+    }
 
 
 def measure(problems: int) -> dict[str, Any]:

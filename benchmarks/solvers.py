@@ -82,8 +82,8 @@ def measure_memory(spec: str, count: int) -> dict[str, Any]:
     runs = [harness.run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
     peak = max(run["peak_bytes"] for run in runs)
     rise = max(run["peak_bytes"] - run["imports_bytes"] for run in runs)
-    found = {"runs": runs, "peak_bytes": peak, "rise_bytes": rise}
-    return {"solver": spec, "set": MEMORY_SET, "count": count, **found}
+    place = {"solver": spec, "set": MEMORY_SET, "count": count}
+    return {**place, "runs": runs, "peak_bytes": peak, "rise_bytes": rise}
 
 
 def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int) -> dict[str, Any]:
