@@ -336,12 +336,12 @@ def plot_errors(results: dict[str, Any], path: Path) -> None:
 
 
 @torch.no_grad()
-def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) -> None:
+def plot_overlays(networks: dict[str, Keypoints], path: Path) -> None:
     """The box as it is and as it is found, over test images."""
     solver = create_solver("pnpnet-set")
     problem = draw(TEST_SEED, 0)
     figure = make_figure(9.0, 3.2)
-    for row, (name, network) in zip(figure.subplots(2, count), networks.items(), strict=True):
+    for row, (name, network) in zip(figure.subplots(2, 6), networks.items(), strict=True):
         pixels, sigma = network(problem.images)
         result = solve(solver, pixels, sigma if name == END else None)
         found, truth = (project(pose, KEYPOINTS) for pose in (result.pose, problem.pose))
