@@ -85,21 +85,18 @@ def oracle(problems: Problems) -> Found:
     return Found(result.pose, result.intrinsics[:, 0, 0], result.ok, 0.0)
 
 
-def one_by_one(solve: Callable[..., tuple[np.ndarray, float] | None], problems: Problems) -> Found:
-    """Call a function of world points, pixels, intrinsics and the index for each problem.
-
-    The function returns the pose (3, 4) and the focal length, or ``None``.
-    """
-    arrays = [x.double().numpy() for x in problems[:3]]
+def one_by_one(solve: Callable[..., tuple[np.ndarray, float] | None], *inputs: Tensor) -> Found:
+    """Call a function for each problem, which returns the pose (3, 4) and the focal length, or ``None``."""
+    arrays = [x.double().numpy() for x in inputs]
     start = time.perf_counter()
-    found = [solve(*inputs, i) for i, inputs in enumerate(zip(*arrays, strict=True))]
+    found = [solve(*one) for one in zip(*arrays, strict=True)]
     us = 1e6 * (time.perf_counter() - start) / len(found)
     columns = zip(*(x or (np.eye(3, 4), 1.0) for x in found), strict=True)
     pose, focal = (torch.from_numpy(np.array(x, dtype=np.float64)) for x in columns)
     return Found(Pose(pose[..., :3], pose[..., 3]), focal, torch.tensor([x is not None for x in found]), us)
 
 
-def colmap_focal(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: int) -> Any:
+def colmap_focal(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> Any:
     """Pycolmap with ``estimate_focal_length``; the camera's guess is 1.2 times its larger side, as COLMAP's."""
     size = 2.0 * intrinsics[:2, 2]
     guess = [1.2 * size.max(), *intrinsics[:2, 2]]
@@ -110,7 +107,7 @@ def colmap_focal(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: 
     return found and (found["cam_from_world"].matrix(), float(found.get("camera", camera).params[0]))
 
 
-def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _: int) -> Any:
+def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> Any:
     """OpenCV's RANSAC at 21 focal lengths; the one with most inliers."""
     size, most, best = 2.0 * intrinsics[:2, 2].max(), 0, None
     solver = OpenCVRansac(threshold=5.0, iterations=100, confidence=0.99, method="SQPNP", refine=False)
@@ -123,17 +120,23 @@ def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, _:
 
 
 #: Solvers of other libraries without the focal length.
-FOCAL_PEERS = {
-    "pycolmap": partial(one_by_one, colmap_focal),
-    "opencv, 21 focals": partial(one_by_one, opencv_focals),
+FOCAL_PEERS: dict[str, Callable[[Problems], Found]] = {
+    "pycolmap": lambda problems: one_by_one(colmap_focal, *problems[:3]),
+    "opencv, 21 focals": lambda problems: one_by_one(opencv_focals, *problems[:3]),
 }
 BY_FOCAL = (*OURS, *FOCAL_PEERS, "oracle")
 
 
-def poselib_rig(world: np.ndarray, img: np.ndarray, models: list[dict[str, Any]], places: np.ndarray) -> Any:
+def pinholes(intrinsics: np.ndarray) -> list[dict[str, Any]]:
+    """Cameras (C, 3, 3) in COLMAP's model PINHOLE."""
+    params = [[k[0, 0], k[1, 1], k[0, 2], k[1, 2]] for k in intrinsics]
+    return [{"model": "PINHOLE", "width": 2000, "height": 2000, "params": x} for x in params]
+
+
+def poselib_rig(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, places: np.ndarray) -> Any:
     """PoseLib's generalised absolute pose; the cameras, whose poses (C, 3, 4) are ``places``, have pairs in turn."""
     options = {"max_reproj_error": RIG_THRESHOLD, "min_iterations": 100, "max_iterations": 10_000}
-    cameras = len(places)
+    cameras, models = len(places), pinholes(intrinsics)
     extrinsics = [poselib.CameraPose() for _ in places]
     for camera, place in zip(extrinsics, places, strict=True):
         camera.R, camera.t = place[:, :3], place[:, 3]
@@ -142,11 +145,12 @@ def poselib_rig(world: np.ndarray, img: np.ndarray, models: list[dict[str, Any]]
     return (np.column_stack((pose.R, pose.t)), 1.0) if report["num_inliers"] else None
 
 
-def pycolmap_rig(world: np.ndarray, img: np.ndarray, models: list[dict[str, Any]], places: np.ndarray) -> Any:
+def pycolmap_rig(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, places: np.ndarray) -> Any:
     """Pycolmap's generalised absolute pose, see :func:`poselib_rig`."""
     options: Any = {"max_error": RIG_THRESHOLD, "min_num_trials": 100, "random_seed": 0}
     at = [*(np.arange(len(world)) % len(places))]
-    cameras, rigid = [pycolmap.Camera(**model) for model in models], [pycolmap.Rigid3d(x) for x in places]
+    cameras = [pycolmap.Camera(**model) for model in pinholes(intrinsics)]
+    rigid = [pycolmap.Rigid3d(x) for x in places]
     found = pycolmap.estimate_and_refine_generalized_absolute_pose(img, world, at, rigid, cameras, options)
     return found and (found["rig_from_world"].matrix(), 1.0)
 
@@ -156,17 +160,11 @@ RIG_PEERS = {"PoseLib": poselib_rig, "pycolmap": pycolmap_rig}
 
 
 def rig_peer(estimate: Callable[..., Any], problems: Problems, cameras: int) -> Found:
-    """Solve rigs with one of ``RIG_PEERS``, one by one; the cameras have COLMAP's model PINHOLE."""
+    """Solve rigs with one of ``RIG_PEERS``, one by one."""
     assert problems.cam_from_rig is not None
     rotation, translation = problems.cam_from_rig
-    places, matrices = torch.cat((rotation, translation[..., None]), -1).numpy(), problems.intrinsics.numpy()
-
-    def solve(world: np.ndarray, img: np.ndarray, _: np.ndarray, i: int) -> Any:
-        pinholes = ([k[0, 0], k[1, 1], k[0, 2], k[1, 2]] for k in matrices[i, :cameras])
-        models = [{"model": "PINHOLE", "width": 2000, "height": 2000, "params": params} for params in pinholes]
-        return estimate(world, img, models, places[i, :cameras])
-
-    return one_by_one(solve, problems)
+    places = torch.cat((rotation, translation[..., None]), -1)
+    return one_by_one(estimate, *problems[:2], problems.intrinsics[:, :cameras], places[:, :cameras])
 
 
 def errors(found: Found, problems: Problems) -> dict[str, Tensor]:

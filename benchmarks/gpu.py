@@ -281,7 +281,11 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
     for name, n in itertools.product(amount.contenders, amount.pairs):
         torch.compiler.reset()
         if name not in OURS:  # on the CPU, one problem after the other
-            yield _looped(name, n, amount)
+            say(f"throughput: {name}, n = {n}")
+            task = contenders.CONTENDERS[name]().task(draw(n, amount.batches[0]))
+            task.warm()
+            place: dict[str, Any] = {"contender": name, "mode": FORWARD, "n": n, "batch": task.size}
+            yield {**place, "success": task.success().rate, **summary([task.us() for _ in range(amount.rounds)])}
             continue
         contender, plain = (OURS[x](device=device) for x in (name, name.removesuffix(" compiled")))
         if not contender.takes(n):
@@ -290,7 +294,7 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         known: dict[str, list[tuple[int, float]]] = {FORWARD: [], BACKWARD: []}  # batches and seconds of a call
         for mode, batch in itertools.product((FORWARD, BACKWARD), amount.batches):
             say(f"throughput: {name}, n = {n}, B = {batch}, {mode}")
-            place: dict[str, Any] = {"contender": name, "mode": mode, "n": n, "batch": batch}
+            place = {"contender": name, "mode": mode, "n": n, "batch": batch}
             if (expected_s := _expected_s(known[mode], batch)) > amount.call_s:
                 yield {**place, "why": f"a call would take about {expected_s:.0f} s"}
                 continue
@@ -323,14 +327,6 @@ def _expected_s(known: list[tuple[int, float]], batch: int) -> float:
         return known[0][1] if known else 0.0
     (small, one), (large, other) = known[-2:]
     return other + max(other - one, 0.0) * (batch - large) / (large - small)
-
-
-def _looped(name: str, n: int, amount: Amount) -> dict[str, Any]:
-    say(f"throughput: {name}, n = {n}")
-    task = contenders.CONTENDERS[name]().task(draw(n, amount.batches[0]))
-    task.warm()
-    place = {"contender": name, "mode": FORWARD, "n": n, "batch": task.size, "success": task.success().rate}
-    return {**place, **summary([task.us() for _ in range(amount.rounds)])}
 
 
 def peak_bytes(task: Task, device: str) -> int | None:

@@ -114,7 +114,7 @@ def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
 
 
 def render(template: str, **facts: Any) -> str:
-    """A page from its template, with the filters ``percent``, ``digits`` and ``foot``. Missing facts are errors."""
+    """A page from its template, with the filters below. Missing facts are errors."""
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
     environment.filters |= {"percent": percent, "digits": three_digits, "foot": foot}

@@ -35,93 +35,21 @@ def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
     return {row["contender"]: row for row in rows if wanted.items() <= row.items()}
 
 
-def successes(row: Row) -> str:
-    """Success in per cent with its interval."""
-    return str(SuccessRate(**row["success"])).replace(" %", "")
-
-
 def is_whole(name: str) -> bool:
     """Whether a contender is a solver of ours that users call, as shipped, in any way."""
     return name.partition(" ")[0] in (TRAINED, ANY)
 
 
-def compiling_pays(alone: Rows, many: Rows, batch: int, first_calls: Mapping[tuple[str, str], float]) -> list[str]:
-    """For each solver, its speedup by compiling, and the number of problems that pay for the compiler."""
+def quickest(results: Row) -> list[dict[str, Any]]:
+    """The quickest batch of each contender on a GPU, with the times of all batches and the time of PoseLib."""
+    rows = [row for row in results["throughput"]["rows"] if "median_us" in row]
+    loops = {row["n"]: row["median_us"] for row in rows if row["contender"] == "poselib"}
     found = []
-    for name in (TRAINED, ANY):
-        compiled = f"{name} compiled"
-        seconds = first_calls.get((compiled, COLD))
-        if seconds is None or not all(key in rows for key in (name, compiled) for rows in (alone, many)):
-            continue
-        parts = []
-        for rows, what in ((many, f"in batches of {batch}"), (alone, "one at a time")):
-            slow, fast = rows[name]["median_us"], rows[compiled]["median_us"]
-            count = 1e6 * seconds / (slow - fast) if fast < slow else 0.0
-            step = 10 ** max(0, len(f"{count:.0f}") - 2)  # two digits
-            pays = f"pays after {round(count / step) * step:,} problems" if count else "never pays"
-            parts.append(f"{slow / fast:.1f} times as fast {what} ({pays})")
-        found.append(f"`{name}` compiled is {' and '.join(parts)}.")
-    return found
-
-
-def leaders(alone: Rows, many: Rows) -> list[str]:
-    """For one problem and for batches, the fastest of ours and of the other libraries."""
-    found = []
-    for what, rows in (("One problem at a time", alone), ("Batches", many)):
-        us = {name: row["median_us"] for name, row in rows.items()}
-        sides = [*filter(is_whole, rows)], [name for name in PEERS if name in rows]
-        if all(sides):
-            fast, slow = sorted((min(side, key=us.__getitem__) for side in sides), key=us.__getitem__)
-            found.append(f"{what}: `{fast}` is fastest, {us[slow] / us[fast]:.1f} times as fast as `{slow}`.")
-    return found
-
-
-def memory(starts: Iterable[Row]) -> dict[str, dict[bool, float]]:
-    """How many MiB calls add to the peak of a process, by contender, without and with gradients."""
-    found: dict[str, dict[bool, float]] = {}
-    for entry in starts:
-        if entry["memory"]:
-            added = entry["memory"]["peak_bytes"] - entry["memory"]["before_bytes"]
-            found.setdefault(entry["contender"], {})[entry["backward"]] = added / 2**20
-    return found
-
-
-def gpu_section(results: Row | None) -> dict[str, Any] | None:
-    """Facts of the section on a GPU, from the file of ``gpu.py``."""
-    if results is None:
-        return None
-    part = results["throughput"]
-    rows = [row for row in part["rows"] if "median_us" in row]
-    loops = {row["n"]: row for row in rows if row["contender"] == "poselib"}
-    groups = figures.grouped((row for row in rows if "work" in row), "contender", "n", "mode")
-    lines = []
-    for group in groups.values():
+    for group in figures.grouped((row for row in rows if "work" in row), "contender", "n", "mode").values():
         best = min(group, key=lambda row: row["median_us"])
-        faster = f"{loops[best['n']]['median_us'] / best['median_us']:.0f}"
-        lines.append({**best, "us": {row["batch"]: row["median_us"] for row in group}, "faster": faster})
-    complete = [x for x in results["parity"]["rows"] if None not in (x.get("same_pose"), x.get("same_gradient"))]
-    return {
-        "made": part["environment"],
-        "poselib_us": loops[N]["median_us"],
-        "count": results["parity"]["settings"]["parity"],
-        "batches": part["settings"]["batches"],
-        "throughput": lines,
-        "graphs": results["graphs"]["rows"],
-        "modes": results["graphs"]["settings"]["modes"],
-        "waits": results["waits"]["rows"],
-        "parity": complete,
-    }
-
-
-def skipped_reasons(results: Rows) -> list[str]:
-    """Why a row is missing, each reason once."""
-    found: dict[str, None] = {}
-    for part in PARTS:
-        for entry in results[part]["skipped"]:
-            place = ", ".join(f"{key} = {entry[key]}" for key in ("n", "batch") if key in entry)
-            mode = f", {entry['mode']}" if entry.get("mode") == BACKWARD else ""
-            found[f"`{entry['contender']}`{f' at {place}' if place else ''}{mode}: {entry['why']}."] = None
-    return list(found)
+        us = {row["batch"]: row["median_us"] for row in group}
+        found.append({**best, "us": us, "loop_us": loops[best["n"]]})
+    return found
 
 
 def page(results: Rows, gpu: Row | None = None) -> str:
@@ -140,21 +68,20 @@ def page(results: Rows, gpu: Row | None = None) -> str:
     return harness.render(
         "performance.md.jinja",
         **{"trained": TRAINED, "plain": PLAIN, "any": ANY, "n": N, "m": ITERATIONS},
-        **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT, "successes": successes, "at": at},
+        **{"angle": COARSE_ANGLE_DEG, "shift": 100 * COARSE_SHIFT, "at": at},
         **{"cold": COLD, "cached": CACHED, "eager": EAGER, "forward": FORWARD, "backward": BACKWARD},
+        successes=lambda row: str(SuccessRate(**row["success"])).replace(" %", ""),
         shipped={"m": shipped.refine.m, "views": shipped.views},
         made=throughput["environment"],
         results=results,
         settings=settings,
         **{"alone": alone, "two": matching(latency, threads=2), "many": many},
         first_calls=first_calls,
-        pays=compiling_pays(alone, many, settings["problems"], first_calls),
-        libraries=[*filter(is_whole, alone), *(peer for peer in PEERS if peer in alone)],
-        leaders=leaders(alone, many),
+        ours=[*filter(is_whole, alone)],
+        peers=[name for name in PEERS if name in alone],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
-        memory=memory(starts),
-        gpu=gpu_section(gpu),
-        skipped=skipped_reasons(results),
+        gpu=gpu,
+        quickest=quickest(gpu) if gpu else [],
     )
 
 
@@ -221,7 +148,9 @@ def render(folder: Path, path: Path) -> None:
     rows, alone = drawn("throughput"), drawn("latency")
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
     batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
-    pairs = [row for row in rows if row["mode"] == FORWARD and (row["batch"] == size or row["n"] != N)]
+    forward = [row for row in rows if row["mode"] == FORWARD]
+    pairs = [row for row in forward if row["n"] == N and row["batch"] == size]
+    pairs += [row for row in forward if row["n"] != N and "compiled" not in row["contender"]]
     plot_times(pictures / "batch.png", "n = 9, 3 mismatches, one thread", batches, against="batch", label="problems B")
     fewer = "".join(f" ({b} at n = {n})" for n, b in sorted({(x["n"], x["batch"]) for x in pairs}) if b < size)
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"

@@ -10,7 +10,7 @@ import math
 import statistics
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import page
-import torch
 from contenders import PLAIN, WHOLE, CannotBeTimedError, Contender, N, Task, draw, make_contenders
 from harness import BACKWARD, FORWARD, HERE, in_turns, recorded, run_child, say, summary, threads
 from page import CACHED, COLD, EAGER
@@ -56,15 +55,13 @@ FULL = Settings()
 QUICK = Settings(None, 20, (1, 20), (6, 9), 20, 3, 0.01, 600.0, 1.0, 20, 1.0, 100)
 
 
-def grid(settings: Settings, count: int) -> Iterator[tuple[int, list[tuple[int, str]]]]:
+def grid(settings: Settings, count: int) -> dict[int, list[tuple[int, str]]]:
     """For each number of pairs the batch sizes and modes; fewer of them with more than one thread."""
     sizes = [size for size in settings.batches if count == 1 or size >= settings.problems]
     backward = [size for size in sizes if size <= settings.most_backward][: None if count == 1 else 1]
-    for n in settings.pairs:
-        if n == N:
-            yield n, [*((size, FORWARD) for size in sizes), *((size, BACKWARD) for size in backward)]
-        elif count == 1:
-            yield n, [(max(1, min(settings.problems, _MOST_PAIRS // n)), FORWARD)]
+    points = {n: [(max(1, min(settings.problems, _MOST_PAIRS // n)), FORWARD)] for n in settings.pairs}
+    at_n = [*((size, FORWARD) for size in sizes), *((size, BACKWARD) for size in backward)]
+    return {**points, N: at_n} if count == 1 else {N: at_n}
 
 
 def ready(
@@ -72,10 +69,10 @@ def ready(
 ) -> tuple[Task, float]:
     """A warm task, and the seconds of its call.
 
-    A loop gets the first problems, enough for ``settings.loop_s`` seconds. ``known``: seconds per problem of an earlier
+    A loop gets the first problems, enough for ``settings.loop_s`` seconds. ``known``: seconds per pair of an earlier
     measurement. CannotBeTimedError when the call would take too long, or the contender cannot compile.
     """
-    expected = known * len(problems.world_points)
+    expected = known * problems.inliers.numel()
     if contender.loops:
         task = contender.task(take(problems, slice(_PROBE)), backward=backward)
         task.seconds()
@@ -89,16 +86,10 @@ def ready(
 def measure_throughput(settings: Settings, count: int) -> dict[str, list[dict[str, Any]]]:
     """Times on ``count`` threads. The entry ``count`` of a row is less than the batch for a loop."""
     rows: list[dict[str, Any]] = []
-    skipped: list[dict[str, Any]] = []
-    # Seconds per problem of the last measurement, scaled in proportion to the number of pairs.
-    known: defaultdict[tuple[str, str], float] = defaultdict(float)
-    before = settings.pairs[0]
-    for n, points in grid(settings, count):
-        known = defaultdict(float, {key: seconds * max(1.0, n / before) for key, seconds in known.items()})
-        before = n
-        torch.compiler.reset()  # compile for this number of pairs only
-        contenders, missing = make_contenders(settings.contenders)
-        skipped += [{**entry, "threads": count, "n": n} for entry in missing]
+    contenders, missing = make_contenders(settings.contenders)
+    skipped = [{**entry, "threads": count} for entry in missing]
+    known: defaultdict[tuple[str, str], float] = defaultdict(float)  # seconds per pair of the last measurement
+    for n, points in grid(settings, count).items():
         problems = draw(n, max(settings.problems, *(batch for batch, _ in points)))
         rates: dict[str, dict[str, Any]] = {}
         for batch, mode in points:
@@ -109,6 +100,8 @@ def measure_throughput(settings: Settings, count: int) -> dict[str, list[dict[st
             for name, contender in contenders.items():
                 if not contender.takes(n) or (backward and not contender.differentiable):
                     continue
+                if n != N and "compiled" in name:  # to compile for each number of pairs takes most of an hour
+                    continue
                 try:
                     task, once = ready(contender, some, settings, backward=backward, known=known[name, mode])
                 except CannotBeTimedError as error:
@@ -117,7 +110,7 @@ def measure_throughput(settings: Settings, count: int) -> dict[str, list[dict[st
                 if name not in rates:  # after the first call, which shows whether the contender compiles
                     rates[name] = rate(contender, take(problems, slice(settings.problems)), settings)
                 tasks[name] = task, once
-                known[name, mode] = once / task.size
+                known[name, mode] = once / task.problems.inliers.numel()
             for name, times in timed(tasks, settings).items():
                 found = {"count": tasks[name][0].size, "success": rates[name], **summary(times)}
                 rows.append({"contender": name, **place, **found})

@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from harness import Row, pivot, recorded, say, share, threads
-from kornia.core.exceptions import BaseError
 from kornia.geometry import epipolar
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -61,6 +60,11 @@ SHARES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 1.0)
 KINDS = ("ratio test", "no ratio test")
 RATIO_TEST = 0.8  # Lowe's value
 BATCH = 500
+FEATURES = 2000  # keypoints of an image
+EVERY = 4  # every fourth image is a query
+VIEWS = 6  # images of the map for each query
+MOST_PAIRS = 500  # of a problem
+SEED = 0  # of the subsets of pairs
 # Points of the map: largest distance to the epipolar line and largest reprojection error in an image of the map, in
 # pixels; smallest angle between two of the rays, in degrees.
 EPIPOLAR_PX, TRIANGULATION_PX, MIN_ANGLE = 2.0, 2.0, 1.5
@@ -134,13 +138,13 @@ class Solved(NamedTuple):
     probability: Tensor  # NaN where the solver has none
 
 
-def read_views(folder: Path, features: int) -> list[View]:
+def read_views(folder: Path) -> list[View]:
     """Detect keypoints in all images of a COLMAP model that have a pose, sorted by name."""
     import cv2
     import pycolmap
 
     model = pycolmap.Reconstruction(str(_find_model(folder)))
-    sift = cv2.SIFT.create(nfeatures=features, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=FEATURES, enable_precise_upscale=True)
     views = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         picture = cv2.imread(str(folder / "images" / image.name), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -229,7 +233,7 @@ def triangulate(views: Sequence[View]) -> list[Floats]:
     return found
 
 
-def choose_images(query: View, database: Sequence[View], points: Sequence[Floats], count: int) -> list[int]:
+def choose_images(query: View, database: Sequence[View], points: Sequence[Floats]) -> list[int]:
     """Images of the map that see the query's place, from near viewpoints to far ones."""
     distances = {}
     for number, (view, known) in enumerate(zip(database, points, strict=True)):
@@ -243,28 +247,29 @@ def choose_images(query: View, database: Sequence[View], points: Sequence[Floats
         angle = np.arccos(np.clip((mine * theirs).sum(1) / (lengths[0] * lengths[1]), -1, 1))
         distances[number] = float(np.median(angle + np.abs(np.log(lengths[0] / lengths[1]))))
     ranked = sorted(distances, key=lambda number: distances[number])
-    at = np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int)
+    at = np.linspace(0, len(ranked) - 1, min(VIEWS, len(ranked))).round().astype(int)
     return [ranked[i] for i in at]
 
 
-def make(folder: Path, out: Path, *, features: int, every: int, views: int, pairs: int, seed: int) -> Matches:
-    """Make the problems of one scene, with the options of the command, write them and read them again."""
-    found = read_views(folder, features)
-    queries, database = found[every // 2 :: every], [v for i, v in enumerate(found) if i % every != every // 2]
+def make(folder: Path, out: Path) -> Matches:
+    """Make the problems of one scene, write them and read them again."""
+    views = read_views(folder)
+    queries = views[EVERY // 2 :: EVERY]
+    database = [view for i, view in enumerate(views) if i % EVERY != EVERY // 2]
     points = triangulate(database)
     known = sum(int(np.isfinite(p[:, 0]).sum()) for p in points)
     say(f"{folder.name}: {len(queries)} queries, {len(database)} images with {known} keypoints with a point")
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(SEED)
     rows: list[dict[str, Any]] = []
     for query in queries:
-        for number in choose_images(query, database, points, views):
+        for number in choose_images(query, database, points):
             match, ratio = nearest(query.descriptors, database[number].descriptors)
             world = points[number][match]
             for kind in range(len(KINDS)):
                 at = np.flatnonzero(np.isfinite(world[:, 0]) & ((ratio < RATIO_TEST) | (kind == 1)))
                 if len(at) < MIN_INLIERS:
                     continue
-                at = generator.permutation(at)[:pairs]
+                at = generator.permutation(at)[:MOST_PAIRS]
                 error = np.linalg.norm(query.project(world[at]) - query.pixels[at], axis=1)
                 error = np.where(np.isnan(error), np.inf, error).astype(np.float32)
                 row = {"world": world[at], "pixels": query.pixels[at], "ratio": ratio[at].astype(np.float32)}
@@ -513,14 +518,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     making = commands.add_parser("make", help="make the problems of one scene")
     making.add_argument("folder", type=Path, help="a COLMAP model with its images in images/")
     making.add_argument("out", type=Path, help="the file of problems (.npz)")
-    for name, default, help_ in (
-        ("features", 2000, "keypoints of an image"),
-        ("every", 4, "with 4, every fourth image is a query"),
-        ("views", 6, "images of the map for each query"),
-        ("pairs", 500, "largest number of pairs of a problem"),
-        ("seed", 0, "seed of the subsets of pairs"),
-    ):
-        making.add_argument(f"--{name}", type=int, default=default, help=help_)
     measuring = commands.add_parser("measure", help="solve problems")
     timing = commands.add_parser("cost", help="time solvers on groups of problems")
     for one in (measuring, timing):
@@ -532,8 +529,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measuring.add_argument("--batch", type=int, nargs="+", default=[BATCH], help="problems in a call of ours")
     options = command.parse_args(arguments)
     if options.command == "make":
-        del options.command
-        print(*describe(make(**vars(options))), sep="\n")
+        print(*describe(make(options.folder, options.out)), sep="\n")
         return
     matches = read(options.problems)
     settings: dict[str, Any] = {"files": [path.name for path in options.problems], "solvers": options.solvers}
@@ -543,10 +539,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32", "told": KNOWN_SIGMAS}
         settings |= {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
         run = partial(measure, matches, options.solvers, options.pictures, options.batch)
-    try:
-        results = recorded(run, **settings)
-    except BaseError as error:
-        command.error(str(error))
+    results = recorded(run, **settings)
     if options.command == "measure":
         print(format_results(results))
     save_results(results, options.out)

@@ -28,6 +28,8 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 EXAMPLE = HERE.parent / "docs" / "examples" / "ray_data.py"
 COMMAND = [sys.executable, "-c", "import sys; from kornia_pnpnet.cli import main; sys.exit(main())", "solve", "--batch"]
+SOLVER, BATCH = "pnpnet-n9", 10_000
+FOLDER = Path("outputs/scale")  # of the problems and the results
 PAIRS, OUTLIERS = 9, 2
 FILE = 250_000  # largest number of problems in a file
 FEW = 1000  # problems of a run that is little more than the start of Ray
@@ -111,47 +113,48 @@ def compare(expected: dict[str, np.ndarray], folder: Path) -> dict[str, int]:
     """Counts of problems that are lost, twice there, or have another result."""
     found = read(folder)
     ids, first = np.unique(found["id"], return_index=True)
-    lost = len(expected["id"]) - len(ids)
-    counts = {"lost": lost, "twice": len(found["id"]) - len(ids)}
     at = np.searchsorted(expected["id"], ids)
-    apart = [np.abs(found[name][first] - expected[name][at]).max(1) for name in POSE]
-    both = found["ok"][first] & expected["ok"][at]
-    counts["other_ok"] = int((found["ok"][first] != expected["ok"][at]).sum())
-    counts["same_bits"] = int((np.maximum(*apart) == 0).sum())
-    counts["beyond_rounding"] = int((both & (np.maximum(*apart) > ROUNDING)).sum())
-    return counts
+    apart = np.maximum(*(np.abs(found[name][first] - expected[name][at]).max(1) for name in POSE))
+    ok, expected_ok = found["ok"][first], expected["ok"][at]
+    return {
+        "lost": len(expected["id"]) - len(ids),
+        "twice": len(found["id"]) - len(ids),
+        "other_ok": int((ok != expected_ok).sum()),
+        "same_bits": int((apart == 0).sum()),
+        "beyond_rounding": int((ok & expected_ok & (apart > ROUNDING)).sum()),
+    }
 
 
-def measure(problems: int, solver: str, batch: int, folder: Path) -> dict[str, Any]:
+def measure(problems: int) -> dict[str, Any]:
     """Draw the problems, and solve them in all ways."""
-    draw(folder / "few", FEW)
-    draw(folder / "problems", problems)
+    draw(FOLDER / "few", FEW)
+    draw(FOLDER / "problems", problems)
     for name in ("start", "loop", "one", "two", "killed", "again", "again.done"):
-        shutil.rmtree(folder / name, ignore_errors=True)
-    same = ["--solver", solver, "--batch-size", str(batch)]
-    source = str(folder / "problems")
+        shutil.rmtree(FOLDER / name, ignore_errors=True)
+    same = ["--solver", SOLVER, "--batch-size", str(BATCH)]
 
-    def ray(name: str, workers: int, *more: str, source: str = source) -> list[str]:
-        return [sys.executable, str(EXAMPLE), source, str(folder / name), *same, "--workers", str(workers), *more]
+    def ray(name: str, workers: int, *more: str, source: str = "problems") -> list[str]:
+        places = str(FOLDER / source), str(FOLDER / name)
+        return [sys.executable, str(EXAMPLE), *places, *same, "--workers", str(workers), *more]
 
     third = problems // 3
     runs = {
-        "start": run(ray("start", 2, source=str(folder / "few"))),
-        "loop": run([*COMMAND, source, "--out", str(folder / "loop"), *same]),
+        "start": run(ray("start", 2, source="few")),
+        "loop": run([*COMMAND, str(FOLDER / "problems"), "--out", str(FOLDER / "loop"), *same]),
         "one": run(ray("one", 1)),
         "two": run(ray("two", 2)),
-        "killed": run(ray("killed", 2), (folder / "killed", third, WORKER)),
-        "stopped": run(ray("again", 2, "--id", "id"), (folder / "again", third, "")),
+        "killed": run(ray("killed", 2), (FOLDER / "killed", third, WORKER)),
+        "stopped": run(ray("again", 2, "--id", "id"), (FOLDER / "again", third, "")),
         "again": run(ray("again", 2, "--id", "id")),
     }
-    expected = read(folder / "loop")
+    expected = read(FOLDER / "loop")
     return {
-        **{"problems": problems, "pairs": PAIRS, "solver": solver, "batch": batch, "cores": os.cpu_count()},
+        **{"problems": problems, "pairs": PAIRS, "solver": SOLVER, "batch": BATCH, "cores": os.cpu_count()},
         "ok": int(expected["ok"].sum()),
-        "problem_bytes": sum(path.stat().st_size for path in (folder / "problems").glob("*.parquet")),
-        "result_bytes": sum(path.stat().st_size for path in (folder / "loop").glob("*.parquet")),
+        "problem_bytes": sum(path.stat().st_size for path in (FOLDER / "problems").glob("*.parquet")),
+        "result_bytes": sum(path.stat().st_size for path in (FOLDER / "loop").glob("*.parquet")),
         "runs": runs,
-        "differences": {name: compare(expected, folder / name) for name in ("one", "two", "killed", "again")},
+        "differences": {name: compare(expected, FOLDER / name) for name in ("one", "two", "killed", "again")},
     }
 
 
@@ -159,11 +162,8 @@ def main() -> None:
     """Measure, and write the results."""
     command = parser(__doc__, HERE / "scale.json")
     command.add_argument("--problems", type=int, default=1_000_000)
-    command.add_argument("--solver", default="pnpnet-n9")
-    command.add_argument("--batch-size", type=int, default=10_000)
-    command.add_argument("--folder", type=Path, default=Path("outputs/scale"), help="of the problems and the results")
     options = command.parse_args()
-    found = measure(options.problems, options.solver, options.batch_size, options.folder)
+    found = measure(options.problems)
     versions = {name: metadata.version(name) for name in ("ray", "pyarrow")}
     write_json(options.out, {"environment": environment(), "versions": versions, **found})
 

@@ -14,7 +14,6 @@ from typing import Any
 import harness
 import torch
 from contenders import bare_call
-from kornia.core.exceptions import BaseError
 from torch import nn
 
 from kornia_pnpnet import pose_errors, success, success_rate
@@ -73,19 +72,6 @@ def measure_set(solvers: Mapping[str, nn.Module], name: str, count: int, repeats
     ]
 
 
-def base_name(spec: str) -> str:
-    """The name of a solver without its options."""
-    return spec.partition(":")[0]
-
-
-def memory_here(spec: str, count: int) -> dict[str, int]:
-    """Solve one large batch in this process; the peak memory before and after."""
-    before = harness.peak_bytes()
-    with harness.threads(), torch.no_grad():
-        load_solver(spec)(*draw(MEMORY_SET, count)[:3])
-    return {"imports_bytes": before, "peak_bytes": harness.peak_bytes()}
-
-
 def measure_memory(spec: str, count: int) -> dict[str, Any]:
     """Solve one large batch in several processes, and find the largest peak.
 
@@ -96,8 +82,8 @@ def measure_memory(spec: str, count: int) -> dict[str, Any]:
     runs = [harness.run_child(Path(__file__), *arguments) for _ in range(MEMORY_RUNS)]
     peak = max(run["peak_bytes"] for run in runs)
     rise = max(run["peak_bytes"] - run["imports_bytes"] for run in runs)
-    found = {"runs": runs, "peak_bytes": peak, "rise_bytes": rise}
-    return {"solver": spec, "set": MEMORY_SET, "count": count, **found}
+    place = {"solver": spec, "set": MEMORY_SET, "count": count}
+    return {**place, "runs": runs, "peak_bytes": peak, "rise_bytes": rise}
 
 
 def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int) -> dict[str, Any]:
@@ -109,13 +95,14 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
         except ImportError as error:
             skipped[spec] = str(error)
             harness.say(f"skipped: {spec}: {error}")
-    wanted = [spec for spec in solvers if memory_count and base_name(spec) == MEMORY_SOLVER]
+    name_of = {spec: spec.partition(":")[0] for spec in solvers}
+    wanted = [spec for spec, name in name_of.items() if memory_count and name == MEMORY_SOLVER]
     memory = [measure_memory(spec, memory_count) for spec in wanted]
     rows = []
     with harness.threads():
         for name, (n, *_) in SETS.items():
             harness.say(name)
-            chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or base_name(spec) in ROBUST}
+            chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or name_of[spec] in ROBUST}
             rows += measure_set(chosen, name, count, repeats)
     return {"skipped": skipped, "rows": rows, "memory": memory}
 
@@ -145,20 +132,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command.add_argument("--memory-count", type=int, default=10_000, help="problems of the memory measurement; 0: none")
     command.add_argument("--memory-of", help=argparse.SUPPRESS)  # a process of `measure_memory`
     options = command.parse_args(arguments)
-    if options.count < 1 or options.repeats < 1 or options.memory_count < 0:
-        command.error("--count and --repeats must be at least 1, --memory-count at least 0")
     if options.memory_of:
-        print(json.dumps(memory_here(options.memory_of, options.memory_count)))
+        before = harness.peak_bytes()
+        with harness.threads(), torch.no_grad():
+            load_solver(options.memory_of)(*draw(MEMORY_SET, options.memory_count)[:3])
+        print(json.dumps({"imports_bytes": before, "peak_bytes": harness.peak_bytes()}))
         return
     given = {"count": options.count, "repeats": options.repeats}
-    try:
-        with harness.threads():  # so that the environment in the file has one thread
-            results = harness.recorded(
-                partial(measure, options.solvers, **given, memory_count=options.memory_count),
-                **{"solvers": options.solvers, **given, "seed": SEED, "dtype": "float64"},
-            )
-    except BaseError as error:
-        command.error(str(error))
+    with harness.threads():  # so that the environment in the file has one thread
+        results = harness.recorded(
+            partial(measure, options.solvers, **given, memory_count=options.memory_count),
+            **{"solvers": options.solvers, **given, "seed": SEED, "dtype": "float64"},
+        )
     if options.out:
         harness.write(options.out, results, page)
     print(page(results))

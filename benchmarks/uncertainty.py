@@ -18,21 +18,13 @@ import torch
 from harness import share
 from torch import Tensor, nn
 
-from kornia_pnpnet import (
-    PnPNet,
-    PosePrior,
-    RobustWeightedLM,
-    create_solver,
-    gravity_prior,
-    pose_covariance,
-    pose_errors,
-)
+from kornia_pnpnet import PnPNet, PosePrior, RobustWeightedLM, create_solver, gravity_prior, pose_covariance
 from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.points import BoxPoints
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.evaluation.named_solvers import load_solver
-from kornia_pnpnet.metrics import success
+from kornia_pnpnet.metrics import pose_errors, success
 from kornia_pnpnet.refine.residual import retract, tangent
 from kornia_pnpnet.result import PnPResult, Pose, Problems
 
@@ -176,13 +168,6 @@ def measure_errors(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     return rows
 
 
-def squared_errors(result: PnPResult, problems: Problems, covariance: Tensor) -> Tensor:
-    """Squared error of each pose by its covariance, (B,)."""
-    omega = tangent(result.rotation @ problems.pose.rotation.mT)
-    error = torch.cat((omega, result.translation - problems.pose.translation), -1)
-    return (error * torch.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
-
-
 @torch.no_grad()
 def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
     """Compare the errors of poses with their covariances, for each kind of noise and number of pairs."""
@@ -196,7 +181,9 @@ def measure_credibility(solver: nn.Module, count: int) -> list[dict[str, Any]]:
         errors, distance = pose_errors(result.pose, problems.pose), problems.pose.translation.norm(dim=-1)
         near = (errors.rotation_error_deg < 10.0) & (errors.translation_error < 0.3 * distance)
         used = result.ok & near & covariance.isfinite().all((1, 2))
-        squared = squared_errors(result, problems, covariance)[used]
+        turn, shift = result.rotation @ problems.pose.rotation.mT, result.translation - problems.pose.translation
+        error = torch.cat((tangent(turn), shift), -1)
+        squared = (error * torch.linalg.solve(covariance, error)).sum(-1)[used]
         row = {"noise": noise, "n": n, "outliers": outliers, "used": share(used)}
         rows.append(row | {"mean": squared.mean().item(), "below": share(squared < LIMIT)})
     return rows

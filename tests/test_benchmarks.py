@@ -188,6 +188,14 @@ def test_throughput_and_latency_have_a_row_for_every_point(tmp_path, monkeypatch
         assert row["success"]["total"] == row["calls"]
 
 
+def test_compiled_solvers_are_measured_with_nine_pairs_only(monkeypatch):
+    contender = contenders.CONTENDERS["refinement"]()  # eager under both names
+    made = dict.fromkeys(("refinement", "refinement compiled"), contender)
+    monkeypatch.setattr(performance, "make_contenders", lambda names: (made, []))
+    rows = performance.measure_throughput(performance.QUICK, 1)["rows"]
+    assert {(row["contender"], row["n"]) for row in rows} == {(name, 9) for name in made} | {("refinement", 6)}
+
+
 def test_a_large_call_shows_in_the_memory_of_its_process():
     request = {"contender": "refinement", "backward": True, "batches": [2], "memory_batch": 5000}
     found = harness.run_child(FOLDER / "process.py", json.dumps(request), OMP_NUM_THREADS="1")

@@ -10,7 +10,7 @@ pytest.importorskip("jinja2")
 
 import matches
 import render
-from rates import compared
+from rates import Rates, compare_all, compared
 
 from kornia_pnpnet.core.environment import BEHAVIOUR
 
@@ -64,10 +64,10 @@ def test_a_solver_is_ahead_or_behind_only_when_intervals_are_apart():
 
     shares = {"won": (0.9, 0.8), "lost": (0.7, 0.8), "even": (0.8, 0.81)}
     rows = [entry(data, name, rate) for data, pair in shares.items() for name, rate in zip("ab", pair, strict=True)]
-    rates = render.Rates({"rows": rows, "data": list(shares), "solvers": ["a", "b"]})
-    standing = render.compare_all([rates], "a", ["b"])
-    assert (standing.ahead, standing.overlapping) == (["won"], ["even"])
-    assert standing.behind == {"lost": ("b", pytest.approx(10.0))}
+    rates = Rates({"rows": rows, "data": list(shares), "solvers": ["a", "b"]})
+    standing = compare_all([rates], "a", ["b"])
+    assert [list(sets) for sets in standing.values()] == [["won"], ["even"], ["lost"]]
+    assert standing["behind"] == {"lost": ("b", pytest.approx(10.0))}
     assert rates.best("lost", ["a", "b"]) == "b"
 
 

@@ -57,9 +57,7 @@ def mislabelled(numbers: np.ndarray, share: float, rng: np.random.Generator) -> 
 
 
 def main() -> None:
-    parser = command(__doc__)
-    parser.add_argument("--frames", type=int, default=60)
-    options = parser.parse_args()
+    options = command(__doc__, frames=60).parse_args()
     rng = np.random.default_rng(0)
     board = cv2.aruco.CharucoBoard(SQUARES, SQUARE, MARKER, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
     corners = np.asarray(board.getChessboardCorners(), dtype=np.float64)

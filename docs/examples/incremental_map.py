@@ -70,9 +70,7 @@ def run(solver: nn.Module, truth: Pose, pixels: Tensor) -> tuple[Pose, float]:
 
 
 def main() -> None:
-    parser = command(__doc__)
-    parser.add_argument("--scenes", type=int, default=20)
-    options = parser.parse_args()
+    options = command(__doc__, scenes=20).parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     runs: dict[str, Any] = {name: {} for name in REGISTER}

@@ -47,7 +47,6 @@ def kornias_dlt(*inputs: Tensor) -> tuple[Pose, Tensor]:
 
 
 SOLVERS: dict[str, Solve] = {"pnpnet-set": ours("pnpnet-set"), "epnp": ours("epnp"), "kornia-dlt": kornias_dlt}
-COLOURS = dict(zip(SOLVERS, (BLUE, ORANGE, GREEN), strict=True))
 
 
 def draw(index: int, keypoints: Tensor, bias: Tensor) -> tuple[Tensor, Tensor, Tensor, Pose]:
@@ -100,8 +99,8 @@ def plot(runs: dict[str, Any], path: Path) -> None:
     """The errors against steps."""
     figure = make_figure(7.0, 3.6)
     axes = figure.subplots()
-    for name, run in runs.items():
-        axes.plot(run["error_px"], color=COLOURS[name], linewidth=1.7, label=name)
+    for (name, run), colour in zip(runs.items(), (BLUE, ORANGE, GREEN), strict=True):
+        axes.plot(run["error_px"], color=colour, linewidth=1.7, label=name)
     axes.set(xlabel="step", ylabel="error of the learned offsets (px)")
     log_scale(axes, "y")
     axes.set_title(f"{WRONG:.0%} of the keypoints anywhere", loc="left")
@@ -110,9 +109,7 @@ def plot(runs: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    parser = command(__doc__)
-    parser.add_argument("--steps", type=int, default=600)
-    options = parser.parse_args()
+    options = command(__doc__, steps=600).parse_args()
     torch.set_num_threads(1)
     runs = {name: learn(solve, options.steps) for name, solve in SOLVERS.items()}
     write(options.out / "keypoint_offsets.json", steps=options.steps, runs=runs)

@@ -16,10 +16,7 @@ keypoint as a standard deviation, as a covariance, or as a factor of the covaria
 
 import copy
 import math
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -339,12 +336,12 @@ def plot_errors(results: dict[str, Any], path: Path) -> None:
 
 
 @torch.no_grad()
-def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) -> None:
+def plot_overlays(networks: dict[str, Keypoints], path: Path) -> None:
     """The box as it is and as it is found, over test images."""
     solver = create_solver("pnpnet-set")
     problem = draw(TEST_SEED, 0)
     figure = make_figure(9.0, 3.2)
-    for row, (name, network) in zip(figure.subplots(2, count), networks.items(), strict=True):
+    for row, (name, network) in zip(figure.subplots(2, 6), networks.items(), strict=True):
         pixels, sigma = network(problem.images)
         result = solve(solver, pixels, sigma if name == END else None)
         found, truth = (project(pose, KEYPOINTS) for pose in (result.pose, problem.pose))
@@ -362,16 +359,13 @@ def plot_overlays(networks: dict[str, Keypoints], path: Path, count: int = 6) ->
 
 
 def main() -> None:
-    parser = command(__doc__)
+    parser = command(__doc__, seeds=3)
     parser.add_argument("--updates", type=int, default=2000, help="of each half of the training")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--jobs", type=int, default=1, help="seeds at the same time")
     parser.add_argument("--batches", type=int, default=32, help="of test images")
     parser.add_argument("--covariances", action="store_true", help="compare kinds of noise; end to end half as long")
     options = parser.parse_args()
-    arguments = range(options.seeds), repeat(options.updates), repeat(options.batches)
-    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
-        runs = list(pool.map(run_covariances if options.covariances else run, *arguments))
+    train_all = run_covariances if options.covariances else run
+    runs = [train_all(seed, options.updates, options.batches) for seed in range(options.seeds)]
     seeds = {str(seed): found for seed, (found, _) in enumerate(runs)}
     results: dict[str, Any] = {"updates": options.updates, "batches": options.batches, "seeds": seeds}
     if options.covariances:

@@ -93,10 +93,7 @@ def train(steps: int, seed: int) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    parser = command(__doc__)
-    parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--seeds", type=int, default=1)
-    options = parser.parse_args()
+    options = command(__doc__, steps=300, seeds=1).parse_args()
     torch.set_num_threads(1)
     curves = [train(options.steps, seed) for seed in range(options.seeds)]
     write(options.out / "pose_network.json", steps=options.steps, curves=curves)

@@ -73,9 +73,7 @@ def latencies(solve: Solve, problems: list[tuple[Tensor, ...]], clients: int) ->
 
 
 def main() -> None:
-    parser = command(__doc__)
-    parser.add_argument("--requests", type=int, default=256)
-    options = parser.parse_args()
+    options = command(__doc__, requests=256).parse_args()
     p = SyntheticProblems(n=50, batch_size=options.requests, outliers=OutlierMix(max_ratio=0.4)).batch(0)
     problems, solver = list(zip(*p[:3], strict=True)), create_solver("pnpnet-set")
     rows: list[dict[str, Any]] = []

@@ -13,10 +13,15 @@ from kornia_pnpnet.evaluation.results import save_results
 from kornia_pnpnet.refine.residual import rotation_angle
 
 
-def command(description: str | None) -> argparse.ArgumentParser:
-    """The command line of an example, whose help shows the description as it is written."""
+def command(description: str | None, **counts: int) -> argparse.ArgumentParser:
+    """The command line of an example, whose help shows the description as it is written.
+
+    It has an option for each of the ``counts``, whole numbers with these defaults.
+    """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/examples"), help="folder of results and pictures")
+    for name, default in counts.items():
+        parser.add_argument(f"--{name}", type=int, default=default, help="default: %(default)s")
     return parser
 
 

@@ -150,12 +150,6 @@ def draw_dots(path: str | Path, heading: Sequence[str], panels: Sequence[Panel])
     return save(figure, path)
 
 
-def _most_important(names: Iterable[str]) -> set[str]:
-    """The names of the solvers that a picture shows."""
-    ranks = {name: [name.startswith(beginning) for beginning in (*_FIRST, "")].index(True) for name in names}
-    return set(sorted(ranks, key=lambda name: (ranks[name], name))[:_MOST])
-
-
 @themed
 def draw_curves(
     path: str | Path, heading: Sequence[str], panels: Sequence[Panel], x: str, styles: Styles | None = None
@@ -165,7 +159,8 @@ def draw_curves(
     A panel is a title, a table with the column ``solver``, and the name of the column on its vertical axis: ``rate`` in
     per cent (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
     """
-    found = _most_important({solver for _, table, _ in panels for solver in table.solver})
+    solvers = sorted({solver for _, table, _ in panels for solver in table.solver})
+    found = sorted(solvers, key=lambda name: [name.startswith(x) for x in (*_FIRST, "")].index(True))[:_MOST]
     styles = {name: look for name, look in (styles or solver_styles(found)).items() if name in found}
     heights = 1.0 + 0.04 * len(styles), 2.4 if len(panels) > 4 else 3.0
     figure, grid, columns = make_panels(len(panels), 4, heights, heading)

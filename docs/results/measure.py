@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -361,21 +361,18 @@ def collect_weights(runs: Sequence[Path], folder: Path) -> None:
     Each run after the first began with the weights of the run before. The folder gets at most 100 rows of each run's
     learning curves, all with a validation, and gives the weights their name. After an error nothing is written.
     """
-    curves = [_validated_rows(run / HISTORY_NAME) for run in runs]
-    for before, rows in pairwise(curves):  # updates count from the first run on
-        rows["update"] += before["update"].iloc[-1]
+    curves: list[pd.DataFrame] = []
+    for path in (run / HISTORY_NAME for run in runs):
+        rows = pd.read_csv(path)
+        rows = rows.dropna(subset=[name for name in rows if name.startswith("val/")], how="all")
+        if rows.empty:
+            raise ValueError(f"'{path}' has no row with a validation.")
+        rows = rows[:: -max(1, -(-len(rows) // _MOST_ROWS))][::-1]  # evenly spaced, the last one included
+        before = curves[-1]["update"].iloc[-1] if curves else 0  # updates count from the first run on
+        curves.append(rows.assign(update=rows["update"] + before))
     results = load_run(runs[-1] / RESULTS_NAME)
     PnPNet.from_pretrained(runs[-1] / "weights")  # raises when they are damaged
     shutil.copytree(runs[-1] / "weights", folder, dirs_exist_ok=True)
     write_json(folder / RESULTS_NAME, to_json(results))
     write_model_card(folder, results, name=folder.name)
     pd.concat(curves).to_csv(folder / HISTORY_NAME, index=False)
-
-
-def _validated_rows(path: Path) -> pd.DataFrame:
-    """Evenly spaced rows with a validation, the last one included."""
-    rows = pd.read_csv(path)
-    rows = rows.dropna(subset=[name for name in rows if name.startswith("val/")], how="all")
-    if rows.empty:
-        raise ValueError(f"'{path}' has no row with a validation.")
-    return rows[:: -max(1, -(-len(rows) // _MOST_ROWS))][::-1].copy()

@@ -1,12 +1,15 @@
-"""The picture of the home page: a house, the pairs that ``pnpnet-set`` rejects, and the pose that it finds."""
+"""The picture of the home page: a house, the pairs that ``pnpnet-set`` rejects, and the pose that it finds.
+
+``house.jpg`` shows the house from the pose below. ``docs/results/house.py`` of commit ccb8600 rendered it.
+"""
 
 import itertools
 import math
 from pathlib import Path
 
 import torch
-from house import HALF_WIDTH, OPENINGS, photograph
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from matplotlib.image import imread
 from torch import Tensor
 
 from kornia_pnpnet import Pose, create_solver, pose_errors
@@ -17,7 +20,7 @@ from kornia_pnpnet.evaluation.plots import BLUE, GREY, VERMILION, WIDTH, make_fi
 _PAIRS, _OUTLIERS, _SEED = 48, 20, 3
 _KEPT = 0.5  # weights above this count as inliers, as on the page about OpenCV
 _HALF_VIEW = 0.31  # tangent of half the field of view that is drawn
-_PHOTO = 560  # pixels across the photograph
+_PHOTO = Path(__file__).with_name("house.jpg")
 _CAMERA = 4.0  # metres; length of a drawn camera
 _VIEWPOINT = {"elev": 20.0, "azim": -60.0}  # degrees
 
@@ -30,6 +33,13 @@ _CORNERS = torch.tensor(
 _BOX = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
 _EDGES = torch.tensor([*_BOX, (4, 8), (7, 8), (5, 9), (6, 9), (8, 9)])
 _IN_SIGHT = _CORNERS[torch.tensor([(0, 1), (1, 2), (0, 4), (1, 5), (2, 6), (4, 5), (4, 8), (5, 9), (6, 9), (8, 9)])]
+# Windows and the door, of the side and of the front: their centre, bottom and top. All have one width.
+_OPENINGS = (
+    [(along, low, low + 1.1) for along in (-1.5, 1.5) for low in (0.9, 2.7)],
+    [(along, low, low + 1.1) for along in (-2.5, 0.0, 2.5) for low in (0.9, 2.7) if (along, low) != (0.0, 0.9)]
+    + [(0.0, 0.0, 2.1)],
+)
+_HALF_WIDTH = 0.45
 _PLACE = torch.tensor([0.0, 3.2, 21.0], dtype=torch.float64)  # metres; the house in the camera's frame
 _TURNS = ((0.2, 0.0, 0.0), (0.0, 0.65, 0.0))  # radians; the camera looks down, and at a corner
 
@@ -43,9 +53,9 @@ def _in_camera(points: Tensor) -> Tensor:
 def _seen_edges() -> Tensor:
     """The ends of the edges in sight, of the house, its windows and its door, shape (E, 2, 3)."""
     ends = []
-    for front, openings in enumerate(OPENINGS):
+    for front, openings in enumerate(_OPENINGS):
         for centre, bottom, top in openings:
-            left, right = centre - HALF_WIDTH, centre + HALF_WIDTH
+            left, right = centre - _HALF_WIDTH, centre + _HALF_WIDTH
             outline = (left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)
             corners = [(x, -up, -3.0) if front else (4.0, -up, x) for x, up in outline]
             ends += list(itertools.pairwise(corners))
@@ -91,9 +101,7 @@ def plot_problem(path: str | Path) -> Path:
     figure = make_figure(WIDTH, 3.3)
     image, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
     pixels, projected, edge = problem.img_points[0], seen(world), _HALF_VIEW * problem.intrinsics[0, 0, 0].item()
-    turned = _in_camera(torch.eye(3, dtype=torch.float64)) - _PLACE
-    photo = photograph(turned.mT.numpy(), _PLACE.numpy(), _HALF_VIEW, _PHOTO)
-    image.imshow(photo, extent=(-edge, edge, edge, -edge), interpolation="bilinear")
+    image.imshow(imread(_PHOTO), extent=(-edge, edge, edge, -edge), interpolation="bilinear")
     for start, end in zip(pixels[~kept], projected[~kept], strict=True):
         image.plot(*torch.stack((start, end)).T, color=VERMILION, linewidth=0.8, alpha=0.7)
     image.plot(*pixels[kept].T, "o", color=BLUE, markersize=5.5, markeredgecolor="white")

@@ -3,17 +3,12 @@
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise, takewhile
+from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from figures import mix_in_words
+from figures import grouped, mix_in_words
 from measure import BOUNDS, HERE
-
-
-def interval(rate: float, low: float, high: float) -> str:
-    """A rate with its interval."""
-    return f"{rate:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def shown(data: str) -> str:
@@ -21,17 +16,6 @@ def shown(data: str) -> str:
     short = data.replace("synthetic, ", "").replace("any_rotation", "any rotation").replace("_", " ")
     short = short.replace("+0 outliers (raw matches)", "raw matches")
     return re.sub(r"(\d)-(\d)", r"\1–\2", short)
-
-
-class Standing(NamedTuple):
-    """Sets by how a solver compares with the best other one: their intervals are apart, or overlap.
-
-    ``behind`` has by set the best other solver, and its lead in points.
-    """
-
-    ahead: list[str]
-    behind: dict[str, tuple[str, float]]
-    overlapping: list[str]
 
 
 class Rates:
@@ -51,32 +35,19 @@ class Rates:
         rates = [self.rate(data, solver) for data in self.sets if data.endswith(ending)]
         return sum(rates) / len(rates)
 
-    def time(self, data: str, solver: str) -> float:
-        """Microseconds per problem."""
-        return float(self.rows[data, solver]["us_per_problem"])
-
     def difference(self, data: str, one: str, other: str) -> tuple[float, bool]:
         """Difference of two solvers in points, and whether their intervals are apart."""
         a, b = (self.rows[data, name]["success"] for name in (one, other))
         return 100 * (a["rate"] - b["rate"]), a["low"] > b["high"] or b["low"] > a["high"]
 
-    def versus(self, data: str, one: str, other: str) -> str:
-        """The difference of two solvers in words."""
-        points, apart = self.difference(data, one, other)
-        return f"{points:+.1f} points ({('ahead' if points > 0 else 'behind') if apart else 'intervals overlap'})"
-
     def best(self, data: str, solvers: Iterable[str]) -> str:
         """The solver with the highest success."""
         return max((name for name in solvers if (data, name) in self.rows), key=lambda name: self.rate(data, name))
 
-    def reach(self, sets: Sequence[str] | None = None) -> float:
+    def reach(self) -> float:
         """The largest half-width of an interval, in points."""
-        found = [row["success"] for (data, _), row in self.rows.items() if data in (sets or self.sets)]
+        found = [row["success"] for row in self.rows.values()]
         return 100 * max(max(one["rate"] - one["low"], one["high"] - one["rate"]) for one in found)
-
-    def cell(self, data: str, solver: str) -> str:
-        """Success in per cent for a table, a dash where the solver did not solve the set."""
-        return f"{self.rate(data, solver):.1f}" if (data, solver) in self.rows else "–"
 
     def first(self, data: str, solver: str) -> bool:
         """Whether no other solver solves more of a set, bounds aside."""
@@ -90,20 +61,20 @@ class Rates:
         return shown(start), [shown(data.removeprefix(f"{start}, ")) for data in self.sets]
 
 
-def compare_all(files: Iterable[Rates], solver: str, others: Sequence[str]) -> Standing:
-    """A solver beside the best of the others, on every set of some results files."""
-    standing = Standing([], {}, [])
+def compare_all(files: Iterable[Rates], solver: str, others: Sequence[str]) -> dict[str, dict[str, tuple[str, float]]]:
+    """All sets of some results files by how a solver compares with the best of the others.
+
+    The solver is ``ahead`` or ``behind`` where the intervals are apart; elsewhere they are ``overlapping``. Each set
+    has the best other solver, and its lead in points.
+    """
+    found: dict[str, dict[str, tuple[str, float]]] = {"ahead": {}, "overlapping": {}, "behind": {}}
     for rates in files:
         for data in rates.sets:
             best = rates.best(data, others)
-            points, apart = rates.difference(data, solver, best)
-            if not apart:
-                standing.overlapping.append(data)
-            elif points > 0:
-                standing.ahead.append(data)
-            else:
-                standing.behind[data] = best, -points
-    return standing
+            lead, apart = rates.difference(data, best, solver)
+            verdict = "overlapping" if not apart else "behind" if lead > 0 else "ahead"
+            found[verdict][data] = best, lead
+    return found
 
 
 EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
@@ -151,12 +122,9 @@ def ablation(rows: Sequence[Row]) -> dict[str, Any]:
     sets = validation_sets(rows)
     recipe = [row for row in rows if row["experiment"] == "recipe"]
     others = [row for row in rows if row not in recipe]
-    kinds: dict[tuple[str, str], list[Row]] = {}
-    for row in others:
-        kinds.setdefault((row["experiment"], row.get(KERNEL, "")), []).append(row)
     findings: dict[str, dict[str, str]] = {}
     verdicts: dict[str, list[str]] = {"Higher success": [], "Lower success": [], "No difference seen": []}
-    for (experiment, kind), runs in kinds.items():
+    for (experiment, kind), runs in grouped(others, "experiment", KERNEL).items():
         found = ", ".join(f"{data} {compared(runs, recipe, data)}" for data in sets)
         verdict = "Lower success" if "(below)" in found else "Higher success" if "(above)" in found else None
         verdicts[verdict or "No difference seen"].append(f"`{f'{experiment} {kind}'.strip()}`")
@@ -174,34 +142,10 @@ def ablation(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def sweep(rows: Sequence[Row]) -> dict[str, Any]:
-    """Facts of the sweep: a table of n and mix against m, and the steps in m and in n at the middle of the other."""
+    """Facts of the sweep: runs by n, m and mix, least times over the mixes, and the middle n and m."""
     runs = {(int(row["model.n"]), int(row["model.m"]), float(row["data.outliers.max_ratio"])): row for row in rows}
     all_n, all_m, mixes = (sorted(set(values)) for values in zip(*runs, strict=True))
     times = {(n, m): min(float(runs[n, m, mix]["us_per_problem"]) for mix in mixes) for n in all_n for m in all_m}
-    n, m = all_n[len(all_n) // 2], all_m[len(all_m) // 2]
-
-    def steps(found: Mapping[int, Row]) -> str:
-        return ", ".join(
-            f"{low} → {high} {compared([found[high]], [found[low]], 'uniform')}" for low, high in pairwise(found)
-        )
-
-    findings = [
-        f"{mix_in_words(mix)}: m at n = {n}, {steps({x: runs[n, x, mix] for x in all_m})}; "
-        f"n at m = {m}, {steps({x: runs[x, m, mix] for x in all_n})}."
-        for mix in mixes
-    ]
+    middle = {"middle_n": all_n[len(all_n) // 2], "middle_m": all_m[len(all_m) // 2]}
     axes = {"n": all_n, "m": all_m, "mixes": {mix: mix_in_words(mix) for mix in mixes}}
-    return {"updates": rows[0]["update"], "runs": runs, "times": times, **axes, "findings": findings}
-
-
-def capacity(rows: Sequence[Row], shipped: str) -> dict[str, Any]:
-    """Facts of the sizes of the set network: a table, and how each size differs from the ``shipped`` one."""
-    sets = validation_sets(rows)
-    recipe = [row for row in rows if row["run"] == shipped]
-    findings = []
-    for row in rows:
-        found = {data: compared([row], recipe, data) for data in sets}
-        apart = ", ".join(f"{data} {text}" for data, text in found.items() if "overlap" not in text)
-        if row not in recipe:
-            findings.append(f"`{row['run']}`: {apart or 'all intervals overlap'}.")
-    return {"updates": rows[0]["update"], "claim": claim("capacity"), "sets": sets, "runs": rows, "findings": findings}
+    return {"updates": rows[0]["update"], "runs": runs, "times": times, **axes, **middle}

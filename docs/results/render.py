@@ -2,16 +2,16 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import rates
 from figures import grouped, paper_figures, plot_real_matches, plot_reliability, plot_sweep
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matches import SEEN, UNSEEN, at_size, overview, page_facts, title
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from problem_picture import plot_problem
-from rates import KERNEL, Rates, ablation, capacity, compare_all, interval, percent, read_summary, shown, sweep
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.evaluation.plots import plot_training
@@ -47,27 +47,15 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, An
     return dict(sorted(found.items(), key=lambda x: (x[0] != ANY, -x[1][0]["success"]["rate"])))
 
 
-def rigs(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Least success on rigs and the range of times as fast as PoseLib."""
-    by_solver = grouped(rows, "solver")
-    ours, theirs = by_solver[ANY], by_solver["PoseLib"]
-    ratios = [y["us"] / x["us"] for x, y in zip(ours, theirs, strict=True)]
-    return {
-        "slowest": min(ratios),
-        "fastest": max(ratios),
-        "least": 100 * min(x["success"] for x in ours),
-        "least_poselib": 100 * min(x["success"] for x in theirs),
-    }
-
-
 def page(overview: str) -> str:
     """The results page as Markdown, with an overview of real matches."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
-    complexity, runs = load("complexity"), {name: read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
+    complexity, runs = load("complexity"), {name: rates.read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
     benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
+    rigs = grouped(cameras["rigs"], "solver")
     at_nine = complexity["n"].index(9)
     any_network: Any = PnPNet.from_pretrained(ANY).init
-    rates = {name: Rates(entry) for name, entry in results.items()}
+    files = {name: rates.Rates(entry) for name, entry in results.items()}
     return written(
         "README.md.jinja",
         ours=OURS,
@@ -75,7 +63,6 @@ def page(overview: str) -> str:
         any=ANY,
         shipped_views=PnPNet.from_pretrained(OURS).views,
         made=results["paper"]["environment"],
-        commits={name: f"{entry['environment']['commit']:.9}" for name, entry in results.items()},
         results=results,
         operations={name: counts[at_nine] for name, counts in complexity["counts"].items()},
         overview=overview,
@@ -84,23 +71,27 @@ def page(overview: str) -> str:
         accuracy_set=ACCURACY_SET,
         benchmark=benchmark,
         unknown_focal=grouped(cameras["real"], "solver"),
-        rigs=rigs(cameras["rigs"]),
-        beside_robust=compare_all((rates["set"], rates["set_real"]), ANY, ROBUST),
-        beside_peers=compare_all((rates["set"], rates["set_real"]), ANY, PEERS),
-        ours_beside_peers=compare_all((rates["paper"], rates["gaussian_pose"], rates["real"]), OURS, PEERS),
+        rigs=rigs,
+        rig_ratios=[other["us"] / own["us"] for own, other in zip(rigs[ANY], rigs["PoseLib"], strict=True)],
+        beside_robust=rates.compare_all((files["set"], files["set_real"]), ANY, ROBUST),
+        beside_peers=rates.compare_all((files["set"], files["set_real"]), ANY, PEERS),
+        ours_beside_peers=rates.compare_all((files["paper"], files["gaussian_pose"], files["real"]), OURS, PEERS),
         honest=load("honesty"),
         believed={name: x["kinds"] for name, x in load("probability").items() if "kinds" in x},
         judged=load("judge")["sets"],
         rate=lambda x: str(SuccessRate(**x)),
-        **{"interval": interval, "percent": percent, "kernel": KERNEL},
+        **{"percent": rates.percent, "compared": rates.compared, "kernel": rates.KERNEL},
         chi_square=CHI_SQUARE_95,
         distribution_table=format_table(results["distribution"]),
-        ablation=ablation(runs["ablation"]),
-        sweep=sweep(runs["sweep"]),
-        capacity=capacity(runs["capacity"], "set-{width}x{layers}x{hidden}".format(**any_network.config)),
+        ablation=rates.ablation(runs["ablation"]),
+        sweep=rates.sweep(runs["sweep"]),
+        claim=rates.claim,
+        sizes={row["run"]: row for row in runs["capacity"]},
+        size_sets=rates.validation_sets(runs["capacity"]),
+        shipped_size="set-{width}x{layers}x{hidden}".format(**any_network.config),
         weights=shipped_weights(),
-        rates=rates,
-        shown=shown,
+        rates=files,
+        shown=rates.shown,
     )
 
 
