@@ -272,13 +272,13 @@ class Normalize(Configured):
             mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
         frame = Frame(centroid.mT, size, mean_scale, order, status, matrices, ignored)
         if noise is not None:
+            sound = (there & has_noise).mT
 
             def scaled(sigma: Tensor, unit: Tensor) -> Tensor:
                 """Divide sigmas. Unknown sigmas are replaced first, so that the gradient of the unit is not NaN."""
-                known = has_noise[:, None] & ~sigma.isnan()
+                known = sound & ~sigma.isnan()
                 return torch.where(known, torch.where(known, sigma, 0.0) / unit, torch.nan)
 
-            sound = (there & has_noise).mT
             img_cov, world_cov = map_tensors(lambda x: torch.where(sound, x, 0.0), noise[2:])
             if img_cov is not None:  # the matrix [[a, b], [0, d]] multiplies pixels
                 a, b, d = (x.mT for x in (horizontal, -camera[1] / camera[0] * vertical, vertical))
@@ -318,13 +318,13 @@ def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _is_usable(noise: Noise, given: Tensor, size: Tensor) -> Tensor:
-    """Whether each sigma is NaN or a finite number of at least 0, and each covariance is semi-definite, bool (B,)."""
+    """Whether sigmas of given pairs are NaN or at least 0 and finite, and covariances semi-definite, bool (B,)."""
     limit = torch.finfo(size.dtype).max ** 0.25
     sigmas = noise.img, noise.world.detach() / size[:, None]
-    usable = [(((x >= 0) & (x < limit)) | x.isnan()).all(-1) for x in sigmas]
+    usable = [((x >= 0) & (x < limit)) | x.isnan() for x in sigmas]
     world_cov = map_tensors(lambda x: x.detach() / size[:, None] / size[:, None], noise.world_cov)
     covariances = noise._replace(world_cov=world_cov).covariances
-    return torch.stack([*usable, *((are_semi_definite(x) | ~given.mT).all(-1) for x in covariances)]).all(0)
+    return torch.stack([(x | ~given.mT).all(-1) for x in (*usable, *map(are_semi_definite, covariances))]).all(0)
 
 
 def _distances(points: Tensor, there: Tensor, padded: bool) -> tuple[Tensor, Tensor]:

@@ -140,8 +140,10 @@ def monte_carlo_pose_loss(
     size, inputs = checked[0]
     noise = inputs.noise
     assert noise is not None
-    known = (noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()).all(1)
-    img, world = (torch.where(known[:, None], x, 1.0) for x in noise[:2])
+    sound = noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()
+    padding = torch.stack([x == 0 for x in (torch.ones_like(noise.img), *inputs[3:5]) if x is not None]).any(0)
+    known = (sound | padding).all(1)
+    img, world = (torch.where(known[:, None] & sound, x, 1.0) for x in noise[:2])
     with torch.no_grad():  # a gradient of the frame would only add noise to the integral's gradient
         _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
         started = [frame.start(map_tensors(lambda y: y.to(frame.size), x.init)) for _, x in checked]
@@ -152,7 +154,9 @@ def monte_carlo_pose_loss(
     points = (inputs.world_points - frame.centroid[:, None]) / unit[..., None]
     problem, _ = Normalize(center=False, scale=False, order=False)(points, *inputs[1:5], noise)
     assert problem.noise is not None
-    problem = problem._replace(noise=problem.noise.bounded(problem.focal))
+    # Padding has no noise.
+    noise = map_tensors(lambda x: x.nan_to_num(1.0), problem.noise).bounded(problem.focal)
+    problem = problem._replace(noise=noise)
 
     axis = points.new_tensor([0.0, 0.0, 1.0])  # a refused problem gets a constant translation
     poses = [Pose(pose.rotation, torch.where(live[:, None], pose.translation, axis)) for pose, _ in started]

@@ -258,14 +258,18 @@ def padding_is_nothing(case: Case) -> None:
     mask = (torch.arange(n) < there).expand(batch, n)
     few = of_pairs(lambda x: x[:, :there], call) if case.takes_any_n else {**call, "mask": mask}
     expected = build(case)(**few)
-    spoiled = of_pairs(lambda x: torch.cat((x[:, :there], torch.full_like(x[:, there:], math.nan)), 1), call)
 
     def cut(result: PnPResult) -> PnPResult:
         cameras = result.intrinsics[:, :there] if result.intrinsics.ndim == 4 else result.intrinsics
         return result._replace(weights=result.weights[:, :there], intrinsics=cameras)
 
-    for absent in ({"mask": mask}, {"weights": mask.to(case.dtype)})[: 1 if case.solver in PEERS else 2]:
-        found = build(case)(**spoiled, **absent)
+    def spoil(x: Tensor) -> Tensor:
+        value = math.nan if absent is masked else -1.0
+        return torch.cat((x[:, :there], torch.full_like(x[:, there:], value)), 1)
+
+    masked, weightless = {"mask": mask}, {"weights": mask.to(case.dtype)}
+    for absent in (masked,) if case.solver in PEERS else (masked, weightless):
+        found = build(case)(**of_pairs(spoil, call), **absent)
         assert not found.weights[:, there:].any()
         assert_near(cut(found), cut(expected))
 

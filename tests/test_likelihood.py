@@ -110,7 +110,8 @@ def test_padding_changes_nothing():
     mask = torch.arange(20).expand(4, 20) < 16
     shorter = loss_of(p._replace(world_points=p.world_points[:, :16], img_points=p.img_points[:, :16]), img_sigma=2.0)
     world = p.world_points.masked_fill(~mask[..., None], torch.nan).requires_grad_()
-    padded = loss_of(p._replace(world_points=world), img_sigma=2.0, mask=mask)
+    sigma = torch.where(mask, 2.0, -1.0)
+    padded = loss_of(p._replace(world_points=world), img_sigma=sigma, mask=mask)
     padded.sum().backward()
     torch.testing.assert_close(padded, shorter)
     assert world.grad.isfinite().all()
