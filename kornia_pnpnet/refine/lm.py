@@ -344,9 +344,7 @@ class RobustWeightedLM(Configured):
             robust = found.mixture.weights(seen)
         weights = torch.where(seen.projection.in_front, plan.prior * robust, 0.0)
         cost = self._cost(seen.projection, plan.problem, plan.prior, shape)
-        chance = probability(seen, plan.problem, found, plan.votes.known)
-        if odds is not None:
-            chance = chance * odds.sigmoid()
+        chance = probability(seen, plan.problem, found, plan.votes.known, odds)
         in_front = (seen.projection.in_front & (plan.prior > 0)).sum(-1) >= MIN_PAIRS
         ok = now.solved & in_front & (chance >= LEAST_PROBABILITY)
         return Refinement(now.state, weights, cost, ok, in_front, chance, found)
