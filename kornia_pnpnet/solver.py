@@ -271,8 +271,8 @@ class PnPNet(PretrainedMixin):
         with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points):
             compiled = self._run.compiled or self._whole.compiled
             single = compiled and len(inputs.world_points) == 1 and not (self._run.failed or self._whole.failed)
-            if compiled:  # a batch of one, or another memory layout, would need a new compilation
-                inputs = map_tensors(lambda x: torch.cat((x, x)) if single else x.contiguous(), inputs)
+            if single:  # a batch of one would need a new compilation
+                inputs = map_tensors(lambda x: torch.cat((x, x)), inputs)
             any_number = not (compiled or trait(self.init, "fixed_pairs"))
             most = trait(self.init, "pairs_at_once")
             result = in_parts(lambda part: self._whole(self._solve, part, call), inputs, most, any_number)

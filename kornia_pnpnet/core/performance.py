@@ -93,7 +93,7 @@ def problems_last(tree: _T) -> _T:
     Elementwise operations then fill the vector registers of the CPU. With 9 pairs per problem, this layout halves the
     time of an iteration of the refinement.
     """
-    return map_tensors(lambda x: x if x.ndim < 2 or are_few(x) else _reversed(_reversed(x).contiguous()), tree)
+    return map_tensors(lambda x: x if x.ndim < 2 or are_few(x) else _last(x), tree)
 
 
 def repeat_problems(tree: _T, count: int) -> _T:
@@ -106,6 +106,11 @@ def repeat_problems(tree: _T, count: int) -> _T:
         return _reversed(last.expand(*last.shape[:-2], count, -1).flatten(-2))
 
     return map_tensors(lambda x: repeat(x) if x.ndim else x, tree)
+
+
+def _last(x: Tensor) -> Tensor:
+    last = _reversed(x)
+    return x if last.is_contiguous() else _reversed(last.contiguous())
 
 
 def _reversed(x: Tensor) -> Tensor:
@@ -274,6 +279,8 @@ class Runner:
         """Call a function."""
         if not self.compiled or compiling() or function.__qualname__ in self.failed:
             return function(*args)
+        # Compiled code is for one memory layout, but layouts of uncompiled results depend on the size of the batch.
+        args = map_tensors(_last, args)
         tensors = list(iter_tensors(args))
         name, first = function.__qualname__, tensors[0]
         many = first.ndim > 1 and first.shape[1] >= _MANY_PAIRS

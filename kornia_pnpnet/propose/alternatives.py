@@ -109,7 +109,7 @@ def reconsider(
     valid: Tensor,
     rival: State | None = None,
     replaced: Tensor | None = None,
-) -> tuple[Progress, Evidence, Tensor | None]:
+) -> tuple[Progress, Evidence, Tensor]:
     """Compare refined poses with rivals. If ``refine.by_residual`` is positive, each problem keeps its likeliest pose.
 
     If the noise is unknown and a larger noise is almost as likely, one rival starts from the refined pose with the
@@ -130,7 +130,7 @@ def reconsider(
 
     Returns:
         The arguments of :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for the
-        states, and the log-odds of the states against the rivals, or ``None`` if no problem has a rival.
+        states, and the log-odds of the states against the rivals, infinite for problems without a rival.
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
     with torch.no_grad():
@@ -157,7 +157,7 @@ def reconsider(
         kinds = (now.state, own), (now.state, wide), (now.state._replace(pose=mirrored), own), (rival, of_rival)
         kind, owners = torch.stack((unclear, unclear, mirrors, apart)).nonzero().unbind(1)
     if not len(owners):
-        return now, found, None
+        return now, found, torch.full_like(found.log_ratio, torch.inf)
     state, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
     every = taken(plan._replace(state=now.state, starts=1), owners)
     tried = Progress.of(state, mixture)
