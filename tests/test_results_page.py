@@ -31,6 +31,7 @@ def test_no_results_file_is_older_than_one_change_of_behaviour():
     found = {path.name: json.loads(path.read_bytes()) for folder in folders for path in folder.glob("*.json")}
     made = {name: (x if "environment" in x else x["throughput"])["environment"] for name, x in found.items()}
     assert {"solvers.json", "paper.json", "gpu.json"} <= made.keys()
+    made.pop("scale.json")  # ways to run one solver, whose results are compared within the run
     assert [name for name, x in made.items() if BEHAVIOUR - x.get("behaviour", 0) > 1] == []
 
 
