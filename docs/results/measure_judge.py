@@ -35,7 +35,6 @@ FITTED, MEASURED = ("pnpnet-set", "p3p-ransac", "pnpnet-set:effort=fixed"), ("ep
 #: Kinds of problems that the fit leaves out. A test of the noise or of the points decides about them.
 LEFT_OUT = ("y up", "left-handed", "row and column", "line", "3 pairs")
 PROBLEMS = 500
-_CERTAIN = 30.0  # log-odds of a pose without rivals
 ARGUMENTS = ("world_points", "img_points", "intrinsics")
 
 
@@ -112,22 +111,22 @@ def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
         self: RobustWeightedLM, plan: Any, now: Any, found: Any = None, odds: Tensor | None = None
     ) -> Any:
         refined = judge(self, plan, now, found, odds)
-        clipped = evidence.clipped(refined.evidence.log_ratio, sigmas[-1])
-        odds = torch.full_like(clipped[0], _CERTAIN) if odds is None else odds.clamp(max=_CERTAIN)
-        seen.append((torch.stack((*clipped, odds), -1).double(), refined.probability > 0))
+        against_rivals = torch.ones_like(refined.probability) if odds is None else odds.sigmoid()
+        variables = torch.stack(evidence.clipped(refined.evidence.log_ratio, sigmas[-1]), -1)
+        seen.append((variables.double(), refined.probability > 0, against_rivals.double()))
         return refined
 
     patch = mock.patch.object
     with patch(evidence, "pose_sigma", watched_sigma), patch(RobustWeightedLM, "judge", watched_judge):
         result = solver(**kind.inputs)
-    variables, usable = (torch.cat(x) for x in zip(*seen, strict=True))
+    variables, usable, against_rivals = (torch.cat(x) for x in zip(*seen, strict=True))
     near = right = torch.zeros_like(result.ok)
     if kind.truth is not None:
         turn, shift = errors(result.pose, kind.truth)
         shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
-    found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right}
-    return {**found, "variables": variables, "usable": usable}
+    found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right, "usable": usable}
+    return {**found, "variables": variables, "against_rivals": against_rivals}
 
 
 def errors(pose: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
@@ -143,19 +142,20 @@ def rates(row: dict[str, Tensor]) -> dict[str, Any]:
 
 
 def fit_law(rows: list[dict[str, Tensor]]) -> list[float]:
-    """Fit the law by maximum likelihood; every kind counts the same. Poses that fail a test are left out."""
-    parts = [tuple(row[key][row["usable"]] for key in ("variables", "near")) for row in rows]
-    variables, near = (torch.cat(x).double() for x in zip(*parts, strict=True))
-    shares = [torch.full(x.shape, 1.0 / len(row["near"])) for (_, x), row in zip(parts, rows, strict=True)]
-    weight, start = torch.cat(shares).double(), (0.0, 0.0, 0.0, 1.0)
-    law = torch.tensor(start, dtype=torch.double, requires_grad=True)
+    """Fit the law by maximum likelihood; every kind counts the same. Poses that fail a test are left out.
+
+    The probability of "near" is that of the law, multiplied by the probability that no rival is the right pose.
+    """
+    parts = [tuple(row[key][row["usable"]] for key in ("variables", "against_rivals", "near")) for row in rows]
+    variables, against_rivals, near = (torch.cat(x) for x in zip(*parts, strict=True))
+    weight = torch.cat([torch.full(x[1].shape, 1.0 / len(row["near"])) for x, row in zip(parts, rows, strict=True)])
+    law = torch.zeros(3, dtype=torch.double, requires_grad=True)
     optimiser = torch.optim.LBFGS([law], max_iter=1000, tolerance_change=1e-12, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        of_evidence, of_rivals = law[0] + variables[:, :2] @ law[1:3], law[3] * variables[:, 2]
-        probability = torch.sigmoid(of_evidence) * torch.sigmoid(of_rivals)
-        value = functional.binary_cross_entropy(probability, near, weight, reduction="sum")
+        probability = torch.sigmoid(law[0] + variables @ law[1:]) * against_rivals
+        value = functional.binary_cross_entropy(probability, near.double(), weight.double(), reduction="sum")
         value.backward()
         return value
 

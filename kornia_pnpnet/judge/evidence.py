@@ -76,10 +76,9 @@ _KEY = math.pi / 4
 
 #: A pose is believed when its :func:`probability` is at least this value.
 LEAST_PROBABILITY = 0.95
-#: Coefficients of :func:`probability`: the constant, and the factors of the evidence, of the logarithm of
-#: :func:`pose_sigma`, and of the log-odds against rivals. ``python docs/results/make.py measure --only probability``
-#: fitted these numbers.
-LAW = (-0.5349, 0.6027, -0.2805, 3.357)
+#: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
+#: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.
+LAW = (-0.3902, 0.6246, -0.2504)
 # Ranges to which the variables of `LAW`, the evidence and the logarithm of `pose_sigma`, are clipped.
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.
@@ -288,8 +287,8 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, odds: Tensor | None = None) -> Tensor:
     """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The probability is a logistic function of the evidence and of log :func:`pose_sigma`, multiplied by a logistic
-    function of the log-odds ``odds`` (B,) of the pose against other poses (``None``: there are none). It is 0 if
+    The probability is a logistic function of the evidence and of log :func:`pose_sigma`, multiplied by the
+    probability from the log-odds ``odds`` (B,) of the pose against other poses (``None``: there are none). It is 0 if
     ``pose_sigma`` is large, if the points of the inliers lie on a line, or if the noise is implausible, because pairs
     of a wrong convention, such as mirrored pixels, have large residuals. If ``known`` (B, 1), noise up to the caller's
     noise is plausible, too.
@@ -300,9 +299,9 @@ def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, 
     sigma = pose_sigma(seen.projection, problem, precision).detach()
     usable = plausible & (sigma < _OPEN) & _leave_a_line(problem.world_points, found.inlier > 0.5)
     log_ratio, log_sigma = clipped(found.log_ratio, sigma)
-    offset, by_evidence, by_sigma, by_odds = LAW
+    offset, by_evidence, by_sigma = LAW
     chance = torch.sigmoid(offset + by_evidence * log_ratio + by_sigma * log_sigma)
-    chance = chance if odds is None else chance * torch.sigmoid(by_odds * odds)
+    chance = chance if odds is None else chance * torch.sigmoid(odds)
     return torch.where(usable, chance, 0.0)
 
 
