@@ -159,14 +159,6 @@ def pycolmap_rig(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, pla
 RIG_PEERS = {"PoseLib": poselib_rig, "pycolmap": pycolmap_rig}
 
 
-def rig_peer(estimate: Callable[..., Any], problems: Problems, cameras: int) -> Found:
-    """Solve rigs with one of ``RIG_PEERS``, one by one."""
-    assert problems.cam_from_rig is not None
-    rotation, translation = problems.cam_from_rig
-    places = torch.cat((rotation, translation[..., None]), -1)
-    return one_by_one(estimate, *problems[:2], problems.intrinsics[:, :cameras], places[:, :cameras])
-
-
 def errors(found: Found, problems: Problems) -> dict[str, Tensor]:
     """Errors of rotation in degrees, of the position in distances, of the focal length relative."""
     turn, shift = relative_errors(found.pose, problems)
@@ -231,11 +223,8 @@ def measure_real(data: Path) -> list[dict[str, Any]]:
             all_ = {key: torch.cat([x[key] for x in each]) for key in each[0]}
             turned, position, focal = all_["rotation_deg"] < 1.0, all_["position"], all_["focal"]
             far = (all_["rotation_deg"] > 10.0) | (position > 0.3)
-            rates = {
-                "success": share(turned & (position < 0.01)),
-                "success_5": share(turned & (position < 0.05) & (focal < 0.05)),
-                "far_but_ok": share(far & all_["ok"]),
-            }
+            exact, near = turned & (position < 0.01), turned & (position < 0.05) & (focal < 0.05)
+            rates = {"success": share(exact), "success_5": share(near), "far_but_ok": share(far & all_["ok"])}
             place = {"kind": title, "solver": name, "count": len(turned)}
             rows.append({**place, **rates, "median_focal": focal.median().item(), "us": all_["us"].mean().item()})
     return rows
@@ -262,9 +251,12 @@ def measure_rigs(count: int, sets: Sequence[tuple[int, float]] = RIG_SETS) -> li
         harness.say(f"rig of {cameras}, baseline {baseline}, n = {n}, {outliers:.0%} outliers")
         shape: dict[str, Any] = {"cameras": cameras, "baseline": baseline, "field_of_view": (50.0, 90.0)}
         problems = random_cameras(n, count, SEED + 200 + k, outliers, **shape)
-        few = take(problems, slice(FEW))
         found = {name: (ours(solver, problems, known=True), problems) for name, solver in solvers.items()}
-        found |= {name: (rig_peer(estimate, few, cameras), few) for name, estimate in RIG_PEERS.items()}
+        few = take(problems, slice(FEW))
+        assert few.cam_from_rig is not None
+        rig = few.cam_from_rig.matrix[:, :cameras, :3]
+        given = *few[:2], few.intrinsics[:, :cameras], rig
+        found |= {name: (one_by_one(estimate, *given), few) for name, estimate in RIG_PEERS.items()}
         place = {"cameras": cameras, "baseline": baseline, "n": n, "share": outliers}
         rows += [{**place, "solver": name, **row(*one, focal=math.inf)} for name, one in found.items()]
     return rows
@@ -279,14 +271,11 @@ def page(results: Row) -> str:
     """The tables as a page."""
     scene_keys = {"scene": "{scene}", f"outliers of {SCENE_N}": "{outliers}"}
     rig_keys = {"cameras": "{cameras}", "baseline": "{baseline}", "n": "{n}", "outliers": "{share:.0%}"}
-    return harness.render(
-        "cameras.md.jinja",
-        results=results,
-        pairs=CELL,
-        focal=pivot(results["focal"], {"n": "{n}", "outliers": "{share:.0%}"}, BY_FOCAL, _solved),
-        scenes=pivot(results["scenes"], scene_keys, BY_FOCAL, _solved),
-        rigs=pivot(results["rigs"], rig_keys, ("pnpnet-set", "p3p-ransac:threshold=10", *RIG_PEERS), _solved),
-    )
+    focal = pivot(results["focal"], {"n": "{n}", "outliers": "{share:.0%}"}, BY_FOCAL, _solved)
+    scenes = pivot(results["scenes"], scene_keys, BY_FOCAL, _solved)
+    rigs = pivot(results["rigs"], rig_keys, ("pnpnet-set", "p3p-ransac:threshold=10", *RIG_PEERS), _solved)
+    tables = {"focal": focal, "scenes": scenes, "rigs": rigs}
+    return harness.render("cameras.md.jinja", results=results, pairs=CELL, **tables)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -298,13 +287,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     def measure() -> dict[str, Any]:
         data, count = options.data, options.count
-        return {
-            "focal": measure_focal(count),
-            "cell": measure_cell(FEW),
-            "real": measure_real(data) if data else [],
-            "scenes": measure_scenes(data, count) if data else [],
-            "rigs": measure_rigs(count),
-        }
+        found = {"focal": measure_focal(count), "cell": measure_cell(FEW), "real": [], "scenes": []}
+        if data:
+            found |= {"real": measure_real(data), "scenes": measure_scenes(data, count)}
+        return {**found, "rigs": measure_rigs(count)}
 
     harness.write(options.out, harness.recorded(measure, count=options.count, seed=SEED), page)
 

@@ -251,8 +251,9 @@ class Onnx(Contender):
     def __init__(self, spec: str) -> None:
         import onnxruntime
 
-        from kornia_pnpnet.export import export_onnx
+        from kornia_pnpnet.export import INPUTS, export_onnx
 
+        self.names = INPUTS
         path = exported(spec, ".onnx", export_onnx)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
@@ -261,10 +262,8 @@ class Onnx(Contender):
 
     def inputs(self, problems: Problems) -> Any:
         """Arrays by the names of the model's inputs."""
-        from kornia_pnpnet.export import INPUTS
-
         tensors = *float_inputs(problems), torch.ones(problems.world_points.shape[:2])
-        return {name: x.numpy() for name, x in zip(INPUTS, tensors, strict=True)}
+        return {name: x.numpy() for name, x in zip(self.names, tensors, strict=True)}
 
     def call(self, inputs: Any) -> Any:
         """Run the session with the whole batch."""

@@ -66,10 +66,8 @@ class Amount(NamedTuple):
 
 FULL = Amount()
 #: A few small problems without compiling, which show that everything runs.
-QUICK = Amount(
-    parity=4, graphs=("pnpnet-n9",), modes=("eager",), calls=(1, 4), waits=(), rounds=3, copied=2**16, side=64
-)
-QUICK = QUICK._replace(contenders=("pnpnet-n9", "epnp-lm"), batches=(4, 8), pairs=(9, 12))
+QUICK = FULL._replace(parity=4, graphs=("pnpnet-n9",), modes=("eager",), calls=(1, 4), waits=(), copied=2**16, side=64)
+QUICK = QUICK._replace(contenders=("pnpnet-n9", "epnp-lm"), batches=(4, 8), pairs=(9, 12), rounds=3)
 
 
 def parity(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
@@ -240,7 +238,6 @@ class Work(TorchDispatchMode):
         self.bytes = self.flops = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run an operation and count."""
         kwargs = kwargs or {}
         result = func(*args, **kwargs)
         if not func.is_view:

@@ -1,7 +1,6 @@
 """What the benchmarks share: threads, timing in turns, processes of their own, results files and tables."""
 
 import argparse
-import itertools
 import json
 import os
 import statistics
@@ -10,7 +9,7 @@ import sys
 import time
 import timeit
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +39,11 @@ def threads(count: int = 1) -> Iterator[None]:
     libraries: list[tuple[Callable[[], int], Callable[[int], None]]] = [(torch.get_num_threads, torch.set_num_threads)]
     if cv2 := sys.modules.get("cv2"):  # its solvers have imported it
         libraries.append((cv2.getNumThreads, cv2.setNumThreads))
-    before = [get() for get, _ in libraries]
-    for _, change in libraries:
-        change(count)
-    try:
+    with ExitStack() as stack:
+        for get, change in libraries:
+            stack.callback(change, get())
+            change(count)
         yield
-    finally:
-        for (_, change), number in zip(libraries, before, strict=True):
-            change(number)
 
 
 def seconds(call: Callable[[], object], times: int = 1, clock: Callable[[], float] = time.perf_counter) -> float:
@@ -57,21 +53,13 @@ def seconds(call: Callable[[], object], times: int = 1, clock: Callable[[], floa
 
 def in_turns(timers: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
     """Ask each timer once in every round, so that a slow minute of the machine hits all of them."""
-    found: dict[str, list[float]] = {name: [] for name in timers}
-    for _, (name, timer) in itertools.product(range(rounds), timers.items()):
-        found[name].append(timer())
-    return found
+    turns = [{name: timer() for name, timer in timers.items()} for _ in range(rounds)]
+    return {name: [turn[name] for turn in turns] for name in timers}
 
 
 def summary(rounds_us: Sequence[float]) -> dict[str, Any]:
     """Median, minimum and all of the times of the rounds."""
     return {"median_us": statistics.median(rounds_us), "min_us": min(rounds_us), "rounds_us": list(rounds_us)}
-
-
-def ratio(mine: Row, theirs: Row) -> float:
-    """Time of theirs by time of mine: the median over the rounds of the ratio in the same round."""
-    rounds = zip(theirs["rounds_us"], mine["rounds_us"], strict=True)
-    return statistics.median(other / own for other, own in rounds)
 
 
 def peak_bytes() -> int:

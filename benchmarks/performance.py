@@ -167,12 +167,8 @@ def measure_latency(settings: Settings, count: int) -> dict[str, list[dict[str, 
 
 def single_tasks(contender: Contender, problems: Problems, settings: Settings) -> list[Task]:
     """Warm tasks of one problem each, for ``settings.latency_s`` seconds of calls."""
-
-    def one(index: int) -> Task:
-        return contender.task(take(problems, slice(index, index + 1)))
-
-    most = max(_TURN, int(settings.latency_s / one(0).warm()))
-    tasks = [one(index) for index in range(min(most, len(problems.world_points)))]
+    tasks = [contender.task(take(problems, slice(i, i + 1))) for i in range(len(problems.world_points))]
+    tasks = tasks[: max(_TURN, int(settings.latency_s / tasks[0].warm()))]
     for task in tasks[:_WARM]:
         task.seconds()
     return tasks
@@ -199,11 +195,10 @@ def measure_part(part: str, settings: Settings) -> dict[str, Any]:
     if part == "startup":
         return measure_startup(settings)
     # One process for each number of threads: code is compiled for the threads of its process.
-    requests = [{"part": part, "settings": settings._asdict(), "count": count} for count in (1, 2)]
-    answers = [
-        run_child(Path(__file__), "--child", json.dumps(request), OMP_NUM_THREADS=str(request["count"]))
-        for request in requests
-    ]
+    answers = []
+    for count in (1, 2):
+        request = json.dumps({"part": part, "settings": settings._asdict(), "count": count})
+        answers.append(run_child(Path(__file__), "--child", request, OMP_NUM_THREADS=str(count)))
     return {key: [entry for answer in answers for entry in answer[key]] for key in ("rows", "skipped")}
 
 

@@ -37,7 +37,7 @@ from kornia_pnpnet import pose_errors
 from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.core.files import read_npz
 from kornia_pnpnet.core.trees import map_tensors, take
-from kornia_pnpnet.data.colmap import _find_model
+from kornia_pnpnet.data.colmap import _find_model, _pinhole
 from kornia_pnpnet.evaluation import SeesTruth
 from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.evaluation.plots import BLUE, GREY, ORANGE, WIDTH, make_figure, save
@@ -159,8 +159,7 @@ def read_views(folder: Path) -> list[View]:
             continue
         # OpenCV counts from the centre of the first pixel, COLMAP from its corner.
         distorted = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64) + 0.5
-        intrinsics = camera.calibration_matrix()
-        pixels = camera.cam_from_img(distorted) @ intrinsics[:2, :2].T + intrinsics[:2, 2]
+        intrinsics, pixels = _pinhole(camera, distorted)
         seen = np.isfinite(pixels).all(1)
         size, pose = (camera.width, camera.height), image.cam_from_world().matrix()
         views.append(View(image.name, size, pixels[seen], descriptors[seen], intrinsics, pose))
@@ -219,9 +218,8 @@ def triangulate(views: Sequence[View]) -> list[Floats]:
     options.ransac.max_error, options.ransac.random_seed = TRIANGULATION_PX, 0
     poses, cameras = [pycolmap.Rigid3d(view.pose) for view in views], []
     for view in views:
-        (fx, _, cx), (_, fy, cy), _ = view.intrinsics
-        width, height = view.size
-        cameras.append(pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, cx, cy]))
+        (width, height), params = view.size, view.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        cameras.append(pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params))
     found = [np.full((len(view.pixels), 3), np.nan) for view in views]
     for track in tracks(views):
         pixels = np.array([views[i].pixels[at] for i, at in track])

@@ -109,18 +109,11 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
 
 def page(results: harness.Row) -> str:
     """The tables as a page."""
-    options: Any = {"by": "set", "align": "l" + len(SETS) * "r"}
-
-    def table(cell: str) -> str:
-        return harness.pivot(results["rows"], {"Solver": "`{solver}`"}, SETS, cell.format_map, **options)
-
-    return harness.render(
-        "solvers.md.jinja",
-        results=results,
-        times=table("{median_us:.1f}"),
-        rates=table("{success[rate]:.1%}"),
-        errors=table("{median_rotation_error_deg:.3f}° · {median_translation_error:.4f}"),
-    )
+    rows, keys, options = results["rows"], {"Solver": "`{solver}`"}, {"by": "set", "align": "l" + len(SETS) * "r"}
+    cells = {"times": "{median_us:.1f}", "rates": "{success[rate]:.1%}"}
+    cells["errors"] = "{median_rotation_error_deg:.3f}° · {median_translation_error:.4f}"
+    tables = {name: harness.pivot(rows, keys, SETS, cell.format_map, **options) for name, cell in cells.items()}
+    return harness.render("solvers.md.jinja", results=results, **tables)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -139,11 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(json.dumps({"imports_bytes": before, "peak_bytes": harness.peak_bytes()}))
         return
     given = {"count": options.count, "repeats": options.repeats}
+    run = partial(measure, options.solvers, **given, memory_count=options.memory_count)
     with harness.threads():  # so that the environment in the file has one thread
-        results = harness.recorded(
-            partial(measure, options.solvers, **given, memory_count=options.memory_count),
-            **{"solvers": options.solvers, **given, "seed": SEED, "dtype": "float64"},
-        )
+        results = harness.recorded(run, solvers=options.solvers, **given, seed=SEED, dtype="float64")
     if options.out:
         harness.write(options.out, results, page)
     print(page(results))

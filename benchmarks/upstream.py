@@ -154,12 +154,8 @@ def page(results: Row) -> str:
     def solved(row: Row) -> str:
         return f"{100 * row['success']:.1f} ({row['us']:,.0f})"
 
-    return render(
-        "upstream.md.jinja",
-        results=results,
-        steps=STEPS,
-        success=pivot(success, keys, [*title.values()], solved, by="title"),
-    )
+    table = pivot(success, keys, [*title.values()], solved, by="title")
+    return render("upstream.md.jinja", results=results, steps=STEPS, success=table)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -30,7 +30,7 @@ __all__ = ["checked_inputs", "given_cameras", "in_parts", "restore_leading"]
 
 _T = TypeVar("_T")
 
-# When `in_parts` removes padding, each problem keeps at least this number of rows. Some of them can be padding.
+# When `in_parts` removes padding, each problem keeps at least this number of rows, which can include padding.
 _LEAST_PAIRS = 16
 
 
@@ -57,8 +57,8 @@ def checked_inputs(
     """Check the arguments of ``PnPNet.forward``, and return the leading dimensions and one batch of one dtype.
 
     Distorted pixels become pixels of pinhole cameras. Bearings become a rig: each pair gets a camera whose optical axis
-    is the pair's bearing. Tensor values are not checked, because reading a value would stall a GPU. Error messages
-    call ``init`` by the name ``init_name``.
+    is the pair's bearing. Tensor values are not checked, because reading a value would stall a GPU. ``init_name`` is
+    the name of ``init`` in error messages.
     """
     is_bearing = isinstance(img_points, Tensor) and img_points.ndim > 1 and img_points.shape[-1] == 3
     if intrinsics is None and is_bearing:
@@ -166,7 +166,7 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, like: Tensor) -> Tensor:
-    """Return the caller's cameras of a rig, one per problem or per pair, scaled so that the last entry is 1."""
+    """Return the caller's camera matrices of a rig, for each problem or each pair, scaled to a last entry of 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = _cameras(intrinsics, size).to(like.dtype)
@@ -186,8 +186,7 @@ def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | N
 
     A part has at most ``most`` pairs for each CPU thread. The size of a part has no limit if ``most`` is ``None`` or
     gradients are recorded. If ``any_number`` is true, ``solve`` accepts any number of pairs. Problems are then grouped
-    by their number of pairs, so that parts have little padding. Grouping saves a third to half of the time if the
-    numbers of pairs differ strongly.
+    by number of pairs, to reduce padding. Grouping saves a third to half of the time if these numbers differ strongly.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:

@@ -23,8 +23,7 @@ with needs("shards", "tables need pyarrow"):
 
 __all__ = ["INPUTS", "OUTPUTS", "Solve", "list_column"]
 
-_PAIRS = -1  # stands for the number of pairs in a shape
-# Shapes of the columns that Solve reads.
+_PAIRS = -1  # in a shape, stands for the number of pairs
 _SHAPES: dict[str, tuple[int, ...]] = {"world_points": (_PAIRS, 3), "img_points": (_PAIRS, 2), "intrinsics": (3, 3)}
 _SHAPES |= dict.fromkeys(("weights", "img_sigma", "world_sigma"), (_PAIRS,))
 #: Columns that :class:`Solve` reads.
@@ -36,28 +35,28 @@ _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
 _NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
 # Names of the values of `Status`. The last name is the status of rows that the solver cannot accept.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
-# Only problems with at least this number of pairs are padded, see `_groups`.
+# Only problems with at least this number of pairs are padded. See `_groups`.
 _PADDED_FROM = 16
 
 
 class Solve:
     r"""Map a table of problems to a table of poses, for example in ``map_batches`` of Ray Data.
 
-    Each row is a problem; the number of pairs N may differ between rows. Each cell is a list of numbers in row-major
+    Each row is a problem. The number of pairs N may differ between rows. Each cell is a list of numbers in row-major
     order: ``world_points`` (3N numbers), ``img_points`` in pixels (2N), and optionally ``intrinsics`` (9), ``weights``
-    (N), ``img_sigma`` in pixels, and ``world_sigma`` in the unit of the world. A sigma has N numbers or one number; NaN
-    means unknown.
+    (N), ``img_sigma`` in pixels, and ``world_sigma`` in the unit of the world. A sigma has N numbers, or one number for
+    all pairs. NaN means an unknown sigma.
 
     The result has the columns ``rotation`` (9), ``translation`` (3), ``weights`` (N), ``cost``, ``ok``, and ``status``
     (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). Rows keep their order, and other columns of the
     table, for example ``id``, are kept. Numbers are float32.
 
-    A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. Its status is
+    A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. The status of a row is
     ``malformed`` if a list is missing or has an incorrect length, or if the solver does not accept the number of pairs.
 
     Args:
         solver: a name of :func:`~kornia_pnpnet.registry.list_solvers`, or a solver.
-        intrinsics: camera matrix of all rows, for tables without the column ``intrinsics``, shape :math:`(3, 3)`.
+        intrinsics: camera matrix, shape :math:`(3, 3)`, for all rows of tables without the column ``intrinsics``.
         options: options of the named solver, see :func:`~kornia_pnpnet.registry.create_solver`.
 
     Raises:
@@ -86,7 +85,7 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve a table. Raise ``ValueCheckError`` if a column is missing, ``TypeCheckError`` if one has no numbers."""
+        """Solve a table. Raise ``ValueCheckError`` for a missing column, ``TypeCheckError`` for one without numbers."""
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"the table has no column {name}")
@@ -146,12 +145,12 @@ class _Cells:
         self.shape, self.one_for_all = _SHAPES[name], name.endswith("_sigma")
 
     def fit(self, counts: np.ndarray) -> np.ndarray:
-        """Whether each cell has the number of entries that its problem needs, bool (rows,)."""
+        """Return whether each cell has the number of entries that the cell's problem needs, bool (rows,)."""
         needed = math.prod(counts if size == _PAIRS else size for size in self.shape)
         return (self.sizes == needed) | (self.one_for_all & (self.sizes == 1))
 
     def take(self, rows: np.ndarray, width: int) -> np.ndarray:
-        """The cells of some rows, padded to ``width`` pairs by repeating the last number of each cell."""
+        """Return the cells of some rows. Each cell is padded to ``width`` pairs by repeating its last number."""
         shape = [width if size == _PAIRS else size for size in self.shape]
         within = np.minimum(np.arange(math.prod(shape)), self.sizes[rows, None] - 1)
         return self.values[self.starts[rows, None] + within].reshape(len(rows), *shape)

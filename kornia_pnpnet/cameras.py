@@ -1,7 +1,7 @@
 """Undistort pixels, convert pixels to bearings, make cameras that look along bearings, and project points.
 
 The *undistorted point* of a pixel lies on the pixel's ray and on the plane z = 1. Rays of a fisheye can miss the plane.
-For a fisheye, the point is instead the unit vector along the ray's (x, y), times the ray's angle to the optical axis.
+For a fisheye, the undistorted point is the unit vector along the ray's (x, y), times the angle to the optical axis.
 """
 
 from __future__ import annotations
@@ -65,11 +65,10 @@ def undistort(
         noise: noise of the distorted pixels.
 
     Returns:
-        The undistorted pixels; whether each pixel could be undistorted, bool :math:`(B, N)`; and the noise of the
-        undistorted pixels. A pixel cannot be undistorted if it is outside the range of the polynomial, if it is more
-        than 85 degrees off the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point
-        replaces such a pixel. Each sigma is multiplied by the root mean square of the singular values of the
-        undistortion's Jacobian.
+        The undistorted pixels; which pixels have a solution, bool :math:`(B, N)`; and the noise of the undistorted
+        pixels. A pixel has no solution if it is outside the range of the polynomial, if it is more than 85 degrees off
+        the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point replaces such a
+        pixel. Each sigma is multiplied by the root mean square singular value of the undistortion's Jacobian.
     """
     check_form(["B", "N", "2"], img_points=img_points)
     camera, _ = pinholes(intrinsics)
@@ -101,7 +100,7 @@ def undistort(
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
     """Replace distorted pixels by pixels of pinhole cameras, see :func:`undistort`.
 
-    Pairs whose pixel cannot be undistorted are masked out. A non-finite pixel stays and makes its problem invalid.
+    Pairs whose pixel cannot be undistorted are masked out. A non-finite pixel is kept, and makes its problem invalid.
     """
     # Rounding errors depend on the memory layout, but results must not depend on the layout of the inputs.
     inputs, dist, fisheye = map_tensors(torch.Tensor.contiguous, (inputs, dist, fisheye))
@@ -164,7 +163,7 @@ def bearings(
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
-    """Raise when both arguments are given, or when a number of coefficients belongs to no lens model."""
+    """Raise an error when both arguments are given, or when no lens model has the number of coefficients."""
     check_tensors({"dist": dist, "fisheye": fisheye})
     if dist is not None and fisheye is not None:
         raise ValueCheckError("Give dist or fisheye, not both.")
@@ -187,8 +186,8 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_form(["*", "3"], rays=rays)
     rays = rays.to(common_dtype({"rays": rays}))
-    largest = rays.detach().abs().amax(-1, keepdim=True)  # after division by this number, squares are finite
-    # The gradient of a direction would overflow if all its entries were below this limit.
+    largest = rays.detach().abs().amax(-1, keepdim=True)  # the squares of rays divided by this number are finite
+    # If all entries of a direction were below this limit, the gradient of the direction would overflow.
     sound = (largest > torch.finfo(rays.dtype).tiny ** 0.5) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
     rays = normalize(torch.where(sound, rays, axis) / torch.where(sound, largest, 1.0), dim=-1)
@@ -201,7 +200,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def looking_along(inputs: Inputs) -> Inputs:
-    """Convert bearings to a rig: each pair has a camera whose optical axis is its bearing."""
+    """Convert bearings to a rig in which each pair has a camera whose optical axis is the bearing of the pair."""
     inputs = map_tensors(torch.Tensor.contiguous, inputs)  # see `with_undistorted`
     rotation, sound = bearing_cameras(inputs.img_points)
     rig = inputs.rig
@@ -219,7 +218,7 @@ def looking_along(inputs: Inputs) -> Inputs:
 
 
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (*, 3, 3) as :func:`~kornia_pnpnet.frame.scaled_cameras` does, and tell which are valid."""
+    """Scale camera matrices (*, 3, 3) by :func:`~kornia_pnpnet.frame.scaled_cameras`, and tell which ones are valid."""
     entries, sound = scaled_cameras(intrinsics.flatten(-2).movedim(-1, 0))
     return entries.movedim(0, -1).unflatten(-1, (3, 3)), sound
 
@@ -281,9 +280,9 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target``, and tell which targets have such a point. Others get 0."""
-    # The longest Newton step is half the distance of the target from the centre. The two steps after the loop carry
-    # gradients to the target and the coefficients. The second of them makes second derivatives exact.
+    """Find points (B, N, 2) that a lens maps to ``target``, else 0, and tell which targets have such a point."""
+    # A Newton step is at most half the distance of the target from the centre. Two steps after the loop give the points
+    # gradients of the target and the coefficients. The second of these steps makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)

@@ -24,10 +24,10 @@ __all__ = ["pose_covariance", "shown_noise"]
 # An information matrix with a unit diagonal is regular if its least eigenvalue exceeds this number. Smaller eigenvalues
 # are rounding errors of float64.
 _LEAST_EIGENVALUE = 1e-13
-# The given focal length may differ from the focal length that fits the pixels at the pose by this factor. A larger
-# difference shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
+# The given focal length may differ by this factor from the focal length that fits the pixels at the pose. A larger
+# factor shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
 _FOCAL_RATIO = 1.5
-# `shown_noise` tries these shares of pixel noise in the mean variance of a pixel. Noise of points is the other share.
+# `shown_noise` tries these shares of the pixel noise in the mean variance of a pixel. The rest is noise of the points.
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
@@ -50,8 +50,8 @@ def pose_covariance(
 
     The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the derivative of pixel
     :math:`i` with respect to the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`.
-    If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)`.
-    The function cay is the Cayley transform. :math:`\Sigma_i` is the covariance of the pixel, see
+    If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with the Cayley
+    transform cay. :math:`\Sigma_i` is the covariance of the pixel, see
     :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. All steps run in float64, with gradients to all arguments.
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
@@ -69,10 +69,10 @@ def pose_covariance(
         world_cov: see ``PnPNet.forward``.
         weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as ``result.inliers.double()``.
             ``None``: 1 for every pair.
-        prior: the prior of the solver's call. Its information is added to the information of the pairs.
+        prior: the prior of the solver's call, whose information is added to the information of the pairs.
         focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
             ``intrinsics`` of the result, not those of the solver's call.
-        focal_sigma: the solver's ``focal_sigma``. Its information is added to the information of the pairs.
+        focal_sigma: the solver's ``focal_sigma``, whose information is added to the information of the pairs.
 
     Returns:
         The covariance in radians and the unit of the world, shape :math:`(B, 6, 6)`, with the dtype of a solver's
@@ -174,7 +174,7 @@ def shown_noise(
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
-    # Variances of the pixels if only the points have noise, with the standard deviation 1.
+    # Variances of the pixels if the points have noise with the standard deviation 1, and the pixels are exact.
     of_points = pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
     mean = (weights * of_points).sum(1) / total
     share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)

@@ -20,8 +20,8 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["Diagnosis", "Trial", "diagnose"]
 
-# Trials are equally good if their evidence per pair differs by less than this number. Noise of 1.28 px in place of 1 px
-# causes this difference.
+# Trials are equally good if their evidence per pair differs by less than this number. A noise of 1.28 px in place of
+# 1 px causes this difference.
 _EQUAL = 0.5
 
 
@@ -29,7 +29,7 @@ class Trial(NamedTuple):
     """Agreement of the pairs with the best pose after one change of the input. Numbers are medians over the batch."""
 
     change: str  #: The change in words.
-    evidence: float  #: Evidence for the pose, see :mod:`kornia_pnpnet.judge.evidence`, divided by the number of pairs.
+    evidence: float  #: Evidence for the pose, divided by the number of pairs, see :mod:`kornia_pnpnet.judge.evidence`.
     agree: float  #: Share of the pairs that are inliers.
     sigma: float  #: Standard deviation of a pixel coordinate, estimated from the inliers, in pixels.
     ok: bool  #: Whether the pose is believed, see :mod:`kornia_pnpnet.judge.evidence`.
@@ -39,7 +39,7 @@ class Diagnosis(NamedTuple):
     """The result of :func:`diagnose`. Its ``str`` is one sentence."""
 
     trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
-    #: The trials that are ``ok`` and equally good. A trial that leaves the pairs unchanged excludes all other trials.
+    #: The equally good ``ok`` trials. If one of these trials leaves the pairs unchanged, it excludes the other trials.
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:
@@ -72,10 +72,10 @@ def diagnose(
             have the same convention.
         img_points: pixels; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``. The largest pixel coordinates stand for the size of the image.
-        pose: the expected pose. ``None``: any pose is accepted.
+        pose: the expected pose. If ``None``, any pose is accepted.
 
     Raises:
-        BaseError: see ``PnPNet.forward``; also for bearings.
+        BaseError: for the reasons of ``PnPNet.forward``, and for bearings.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems

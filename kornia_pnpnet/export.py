@@ -59,7 +59,7 @@ class ExportedResult(NamedTuple):
 
 
 class ExportedCamera(NamedTuple):
-    """The fields of :class:`ExportedResult`, and ``camera``: the result's ``intrinsics``, shape :math:`(B, 3, 3)`."""
+    """The fields of :class:`ExportedResult`, then ``camera``: the result's ``intrinsics``, shape :math:`(B, 3, 3)`."""
 
     rotation: Tensor
     translation: Tensor
@@ -75,11 +75,11 @@ INPUTS = ("world_points", "img_points", "intrinsics", "weights")
 RIG_INPUTS = (*INPUTS, "rig_rotation", "rig_translation")
 #: Names of the outputs of a solver with a known focal length.
 OUTPUTS = ExportedResult._fields
-# Upper bounds of the dynamic dimensions. With finite ranges torch.export can simplify its guards.
+# Upper bounds of the dynamic dimensions. With finite ranges, torch.export can simplify its guards.
 _MAX_BATCH, _MAX_N = 2**20, 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
-# Name of the model in a package of one model, and the folder of the models in the archive of a package.
+# Name of the only model in a package of one model, and folder of all models in the archive of a package.
 _MODEL, _MODELS = "model", "/data/aotinductor/"
 
 
@@ -106,15 +106,15 @@ def export_program(
 
     Args:
         solver: a solver whose initialiser is not RANSAC. The program always uses ``effort="fixed"``.
-        n: number of pairs per problem. ``None``: the number that the network was built for. If the network was built
-            for no particular number, the exported solver accepts every number from 4.
-        batch: number of problems in each call. A compiler can optimise for a fixed number. ``None``: any number.
+        n: number of pairs per problem. ``None`` means the number for which the network was built. If the network was
+            built for no particular number, ``None`` means every number of at least 4.
+        batch: number of problems in each call; ``None`` means any number. A compiler can optimise for a fixed number.
         rig: whether the program solves problems of rigs (several cameras with one pose).
 
     Returns:
-        A program that maps :data:`INPUTS`, with the shapes of ``PnPNet.forward``, to the fields of
-        :class:`ExportedResult`, or of :class:`ExportedCamera` if the focal length is unknown. Padding needs weight 0.
-        A program for rigs takes :data:`RIG_INPUTS`, with a camera matrix for each pair, :math:`(B, N, 3, 3)`.
+        A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, or of :class:`ExportedCamera` if
+        the focal length is unknown. Inputs have the shapes of ``PnPNet.forward``. Pairs of padding need the weight 0. A
+        program for rigs takes :data:`RIG_INPUTS`, with a camera matrix for each pair, :math:`(B, N, 3, 3)`.
 
     Raises:
         BaseError: when ``n`` is less than 3 or not the number that the network was built for, or when ``batch`` is less
@@ -157,7 +157,7 @@ def export_program(
 
 
 def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
-    """The fixed number of pairs of a program; ``None``: any number."""
+    """Return the fixed number of pairs of a program, or ``None`` if the program takes any number."""
     config: Any = getattr(solver.init, "config", {})
     return int(config["n"]) if trait(solver.init, "fixed_pairs") else n
 
@@ -194,16 +194,16 @@ def export_package(
 ) -> Path:
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
-    :func:`load_package` loads the package without tracing or compiling. C++ programs need only libtorch to load it. A
-    package runs on one thread. It needs the same PyTorch version as the program that compiled it, and a CPU with the
-    instruction sets (for example AVX-512) of the CPU that compiled it. Compiling takes minutes. An existing file is
-    replaced only when the package is complete.
+    :func:`load_package` loads the package without tracing or compiling. C++ programs need only libtorch to load a
+    package. A package runs on one thread, with the version of PyTorch that compiled it, on a CPU with the instruction
+    sets (for example AVX-512) of the CPU that compiled it. Compiling takes minutes. An existing file is replaced only
+    when the package is complete.
 
     A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
     packages. With PyTorch's own loader, a call of such a package overwrites the previous result of the same thread.
 
-    ``n`` may also be several numbers of pairs, such as ``(16, 64, 256)``. The file then holds a model for each number,
-    and a problem is padded to the next of these numbers. C++ programs choose a model by its name: "n16" is the model
+    If ``n`` has several numbers of pairs, such as ``(16, 64, 256)``, the package holds a model for each number, and a
+    problem is padded to the next of these numbers. C++ programs choose a model by the model's name: "n16" is the model
     for 16 pairs. The name of a single model is "model".
 
     Returns:
@@ -233,8 +233,8 @@ def _compiled(solver: PnPNet, n: int | None, *, batch: int | None, rig: bool) ->
     program = export_program(solver, n, batch=batch, rig=rig)
     pairs = _fixed_n(solver, n)
     metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}
-    # For one problem, operator calls and allocations take most of the time, and inlining avoids both. For several
-    # problems, inlined operators are slower than calls.
+    # For one problem, operator calls and allocations take most of the time, and inlined operators avoid both. For
+    # several problems, inlined operators are slower than calls.
     inline = batch == 1 and pairs is not None
     options = {**package_options(pairs, on_stack=inline), "aot_inductor.metadata": metadata}
     with warnings.catch_warnings(action="ignore"):  # the compiler warns about its own code
@@ -250,8 +250,8 @@ class PackagedSolver:
 
     Attributes:
         batch: number of problems in each call; ``None``: any number.
-        sizes: the numbers of pairs for which the package has models, in increasing order; empty: any number of at least
-            4. With several models, each problem is padded and solved by the smallest model that is large enough.
+        sizes: the numbers of pairs for which the package has models, in increasing order; empty for any number from 4.
+            With several models, each problem is padded and solved by the smallest model that is large enough.
         rig: whether the package solves problems of rigs.
     """
 

@@ -46,8 +46,8 @@ class Frame(NamedTuple):
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
             :math:`(B, N, 3, 3)`. The identity replaces invalid matrices.
-        ignored: ``Status.CONFIDENCE`` or ``Status.INIT`` if the confidence of a pair or the initial pose was invalid
-            and ignored, else ``Status.SOLVED``, int64, shape :math:`(B,)`; ``None``: the caller gave no such argument.
+        ignored: ``Status.INIT`` if an invalid initial pose was ignored, else ``Status.CONFIDENCE`` if pairs of invalid
+            confidence were left out, else ``Status.SOLVED``, int64, shape :math:`(B,)`; ``None``: neither was given.
     """
 
     centroid: Tensor
@@ -91,7 +91,7 @@ class Frame(NamedTuple):
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
 
     def start(self, init: Pose | None) -> tuple[Pose, Tensor]:
-        """Express the caller's pose, or the identity, in this frame, and tell which poses are usable, bool (B,)."""
+        """Express the caller's poses (``None``: identities) in this frame, and tell which are usable, bool (B,)."""
         eye = torch.eye(3, dtype=self.size.dtype, device=self.size.device).expand(self.size.shape[0], 3, 3)
         init = Pose(eye, torch.zeros_like(self.centroid)) if init is None else init
         values = torch.cat((init.rotation.flatten(1), self.apply(init).translation), 1).detach()
@@ -105,15 +105,15 @@ class Normalize(Configured):
     Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0.
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
-    with or without skew). At least three of its pairs have a positive weight. Its points span more than a line, by more
+    with or without skew). At least three of its pairs have a positive weight. Its points deviate from any line by more
     than the rounding of coordinates. The inputs of invalid problems are replaced by zeros, so that all later values and
     gradients are finite. A pair of weight 0 is padding. The coordinates of padding are ignored.
 
     Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
     the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
-    five typical distances from the median of the points (25 with fewer than 12 pairs). The typical distance is the
-    radius around the median that contains two thirds of the points. A pair loses its weight if its point is more than a
-    million typical distances from the median, or if its pixel is almost 90° off the axis.
+    five typical distances from the median of the points (25 for fewer than 12 pairs). The typical distance is the
+    radius of the sphere around the median that contains two thirds of the points. A pair loses its weight if its point
+    is more than a million typical distances from the median, or if its pixel is almost 90° off the axis.
 
     Args:
         f_const: focal length of the normalised camera in pixels.
@@ -182,23 +182,22 @@ class Normalize(Configured):
         elif mask is not None:
             weights = torch.where(mask, weights, 0.0)
         # From here on the batch is the last dimension. `rows` (6, N, B) holds the coordinates and the weight of each
-        # pair. `camera` (9, B) holds the entries of each matrix: fx, fy = camera[:5:4] and cx, cy = camera[2:6:3].
+        # pair. `camera` (9, 1 or N, B) holds the matrix entries: fx, fy = camera[:5:4] and cx, cy = camera[2:6:3].
         rows = torch.cat((world_points.permute(2, 1, 0), img_points.permute(2, 1, 0), weights.mT[None]))
         zero, one = rows.new_zeros(1, batch), rows.new_ones(1, batch)
-        # In a rig `cameras` holds the entries of each pair's matrix, (9, N, B).
         cameras = intrinsics.flatten(-2)
         cameras = cameras.mT if intrinsics.ndim == 3 else cameras.permute(2, 1, 0)
         cameras, is_camera = scaled_cameras(cameras.contiguous())
         camera = cameras[:, None] if intrinsics.ndim == 3 else cameras  # (9, 1 or N, B)
 
-        # Fourth powers of numbers between `limit` and its inverse neither overflow nor underflow. NaN fails each test.
+        # Fourth powers of numbers from 1 / `limit` to `limit` neither overflow nor underflow. NaN fails every test.
         limits = torch.finfo(rows.dtype)
         limit = limits.max**0.25
         given = rows[5] != 0
         sizes = rows.detach().abs()
         if padded:
             sizes = torch.where(given, sizes, zero)
-        # The sum is tested, because the maximum of ONNX Runtime ignores NaN. Sums of coordinates must not overflow.
+        # The sum of `sizes` is tested, because the maximum of ONNX Runtime ignores NaN. Sums must not overflow.
         is_finite = sizes.sum((0, 1), dtype=torch.float64) < limits.max
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
@@ -218,10 +217,10 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, typical.new_full((), _FAR_OF_FEW), _FAR) * typical
         seen = there & (off_axis <= self.f_const * _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # if few are seen, keep wide angles
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # few seen pairs: keep wide angles
         is_usual = usual.to(rows.dtype)
 
-        # Compute centre and scale from the usual points. Squares are in units of the largest coordinate.
+        # Compute centre and scale from the usual points. Before squaring, coordinates are divided by the largest one.
         share = is_usual.sum(0).clamp(min=1.0).reciprocal()
         usual_points = rows[:3] * is_usual
         mean = usual_points.sum(1) * share
@@ -300,10 +299,10 @@ class Normalize(Configured):
 
 
 def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (9, ...) to a last entry of 1, and tell which are valid.
+    """Scale camera matrices (9, ...) to a last entry of 1, and tell which matrices are valid.
 
-    A valid matrix has zeros below its diagonal and focal lengths that are not 0. The fourth powers of its entries and
-    of the inverses of its focal lengths and of its last entry are finite. The identity replaces an invalid matrix.
+    A valid matrix has zeros below its diagonal and focal lengths that are not 0. Its entries, the inverses of its focal
+    lengths, and the inverse of its last entry have finite fourth powers. The identity replaces an invalid matrix.
     """
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()
@@ -318,7 +317,7 @@ def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _is_usable(noise: Noise, given: Tensor, size: Tensor) -> Tensor:
-    """Whether sigmas of given pairs are NaN or at least 0 and finite, and covariances semi-definite, bool (B,)."""
+    """Whether each sigma of ``given`` pairs is NaN or in [0, limit), and each covariance semi-definite, bool (B,)."""
     limit = torch.finfo(size.dtype).max ** 0.25
     sigmas = noise.img, noise.world.detach() / size[:, None]
     usable = [((x >= 0) & (x < limit)) | x.isnan() for x in sigmas]

@@ -34,7 +34,7 @@ _PRIOR_TRANSLATION = 0.5
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth, as a share of the distance to the points. Smaller depths are raised to it, and the residual is penalised.
+# Depths are raised to at least this share of the distance to the points, and raising adds a penalty to the residual.
 _LEAST_DEPTH = 0.02
 
 
@@ -61,8 +61,8 @@ def monte_carlo_pose_loss(
 
     The likelihood compares the true pose with all other poses. The loss has useful gradients from the first step of a
     training, when no pose fits the correspondences. The density of a pose :math:`y` is
-    :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted sum of the robust losses of the
-    residuals, which are in standard deviations. If the world points have noise, the cost includes the logarithm of the
+    :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted sum of the pairs' robust losses.
+    Residuals are in standard deviations. If world points have noise, the cost includes the logarithm of each pixel's
     variance. In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the true
     translation. The scale of this distribution is half the distance between camera and points. Importance sampling
     estimates the constant :math:`Z`.
@@ -154,7 +154,7 @@ def monte_carlo_pose_loss(
     points = (inputs.world_points - frame.centroid[:, None]) / unit[..., None]
     problem, _ = Normalize(center=False, scale=False, order=False)(points, *inputs[1:5], noise)
     assert problem.noise is not None
-    # Padding has no noise.
+    # The noise of padding is NaN, and becomes 1.
     noise = map_tensors(lambda x: x.nan_to_num(1.0), problem.noise).bounded(problem.focal)
     problem = problem._replace(noise=noise)
 
@@ -189,7 +189,7 @@ class _Prior(NamedTuple):
         return self.translation.norm(dim=-1, keepdim=True)
 
     def sample(self, count: int) -> Pose:
-        """Draw poses, (S, B, ...)."""
+        """Draw ``count`` poses for each problem, (S, B, ...)."""
         random = self.translation.new_empty(count, len(self.translation), 4).normal_()
         rotation = quaternion_to_rotation_matrix(random)
         shift = _PRIOR_TRANSLATION * self.distance * _sample_t(count, self.translation)
@@ -203,20 +203,18 @@ class _Prior(NamedTuple):
 
 
 class _Component(NamedTuple):
-    """A t distribution around a pose. ``factor`` is the Cholesky factor of its precision matrix, (B, 6, 6)."""
+    """A t distribution around a pose, with the Cholesky ``factor`` (B, 6, 6) of its precision matrix."""
 
     pose: Pose
     factor: Tensor
 
     def sample(self, count: int) -> Pose:
-        """Draw poses, (S, B, ...)."""
         vectors = _sample_t(count, self.factor[..., 0])  # (S, B, 6)
         tangents = torch.linalg.solve_triangular(self.factor.mT, vectors.permute(1, 2, 0), upper=True).permute(2, 0, 1)
         origin = map_tensors(lambda x: x.expand(count, *x.shape).flatten(0, 1), self.pose)
         return map_tensors(lambda x: x.unflatten(0, (count, -1)), retract(origin, tangents.flatten(0, 1)))
 
     def log_density(self, poses: Pose) -> Tensor:
-        """Logarithm of the density per radian³ and unit³, (S, B)."""
         omega = tangent(poses.rotation @ self.pose.rotation.mT)
         vector = torch.cat((omega, poses.translation - self.pose.translation), -1)
         sq_distance = (vector[..., None, :] @ self.factor)[..., 0, :].square().sum(-1)
@@ -235,7 +233,7 @@ class _Posterior(NamedTuple):
     noisy_points: bool  # whether world points have noise, so that the variance of a pixel depends on the pose
 
     def log_density(self, poses: Pose) -> Tensor:
-        """Logarithm of likelihood times prior, (S, B). The poses have the shapes (S, B, 3, 3) and (S, B, 3)."""
+        """Logarithm of the product of likelihood and prior, (S, B), for poses (S, B, 3, 3) and (S, B, 3)."""
         problem, noise, distance = self.problem, self.problem.noise, self.prior.distance
         assert noise is not None
         cam = problem.world_points @ poses.rotation.mT + poses.translation[..., None, :]  # (S, B, N, 3)

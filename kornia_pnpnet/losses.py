@@ -26,7 +26,7 @@ from kornia_pnpnet.result import PnPResult, Pose, Problems, check_pose, check_po
 
 __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
-# Least probability in the cross entropy, so that the loss of a single pair is bounded.
+# Probabilities in the cross entropy are at least this number, so that the loss of a single pair is bounded.
 _LEAST_PROBABILITY = 1e-3
 # Squared residuals, as multiples of the variance, are clipped to this value, because larger residuals are not noise.
 _MOST_VARIANCES = 20.0
@@ -37,7 +37,7 @@ class LossTerms(NamedTuple):
 
     total: Tensor  #: Weighted sum of the terms. The refined distances are saturated, see :class:`PoseLoss`.
     init_rotation: Tensor  #: Chordal rotation distance of the first guess.
-    init_translation: Tensor  #: Translation distance of the first guess, compared at the centroid of the points.
+    init_translation: Tensor  #: Translation distance of the first guess, measured at the centroid of the points.
     refined_rotation: Tensor  #: Chordal rotation distance after refinement.
     refined_translation: Tensor  #: Translation distance after refinement.
     weights: Tensor  #: Cross entropy of the weights, which are inlier probabilities; 0 in :class:`PoseLoss`.
@@ -148,20 +148,20 @@ class PoseLoss(nn.Module):
 class SetLoss(nn.Module):
     r"""The loss of poses, inlier probabilities and noise, for training :class:`~kornia_pnpnet.propose.set.SetInit`.
 
-    Translations are compared at the centroid of the points, in units of the centroid's distance. The terms are:
+    Translations are compared at the points' centroid, in units of its distance from the camera. The terms are:
 
     - First guess: a weighted mean of the best hypothesis's distance and the mean distance of all hypotheses. The best
       hypothesis has most of the weight, so that hypotheses can differ.
-    - Refined pose: the sum of the rotation and translation distances, each divided by its limit of success. The sum is
-      saturated as in :class:`PoseLoss`.
+    - Refined pose: the sum of the rotation and translation distances in units of ``rotation_unit`` and
+      ``translation_unit``. The sum is saturated as in :class:`PoseLoss`.
     - Binary cross entropy of the network's weights.
     - Negative log-likelihood of the estimated noise, given the inliers' residuals at the true pose.
 
     Args:
         starts: number of the network's hypotheses, which are the first poses of ``guess``.
-        every: weight of the mean over the hypotheses. The best hypothesis has the weight ``1 - every``.
+        every: weight of the mean distance of all hypotheses. The best hypothesis has the weight ``1 - every``.
         refined: weight of the refined term, for ``ramp=1``.
-        saturation: :math:`c` of :class:`PoseLoss`, as a multiple of the limits of success.
+        saturation: :math:`c` of :class:`PoseLoss` for the sum of the refined pose.
         weights: weight of the cross entropy.
         noise: weight of the negative log-likelihood.
         rotation_unit: largest rotation error of a success, in degrees.

@@ -1,4 +1,4 @@
-"""Make pixels from heat maps and world points from depth, both with covariances, for a solver."""
+"""Make inputs of a solver with covariances: pixels from heat maps, and world points from pixels with depth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from kornia_pnpnet.result import Pose, camera_matrices, check_pose, sound_pose, 
 
 __all__ = ["depth_points", "heatmap_keypoints"]
 
-# Variance of a uniform distribution over one cell, per axis, in squared cells.
+# Variance per axis of a uniform distribution over one cell, in squared cells.
 _CELL_VARIANCE = 1.0 / 12.0
 
 
@@ -36,9 +36,9 @@ def heatmap_keypoints(
 ) -> tuple[Tensor, Tensor]:
     r"""Compute a keypoint and its covariance for each heat map: the mean and the covariance of the map's softmax.
 
-    The softmax of a map is a density that is constant in each cell. Its mean is Kornia's soft-argmax. Its covariance is
-    the covariance of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction). It is thus
-    positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
+    The softmax of a map is a density that is constant in each cell. The mean of this density is Kornia's soft-argmax.
+    The covariance is that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), and
+    is thus positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
@@ -56,7 +56,7 @@ def heatmap_keypoints(
 
     Raises:
         BaseError: when ``heatmaps`` is not a real tensor of maps with at least one cell, when ``temperature`` does not
-            broadcast to its shape, or when ``temperature`` or ``stride`` is a number that is not positive.
+            broadcast to ``heatmaps``, or when ``temperature`` or ``stride`` is a number that is not positive.
 
     Example:
         >>> heatmaps = torch.full((1, 1, 5, 5), -100.0)

@@ -1,4 +1,4 @@
-"""Evaluation metrics: pose errors in degrees and in the unit of the world, success rates, calibration."""
+"""Evaluation metrics: success rates, calibration, and pose errors in degrees and in the unit of the world."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kornia_pnpnet.result import Pose, check_poses
 
 __all__ = ["PoseErrors", "Reliability", "SuccessRate", "pose_errors", "reliability", "success", "success_rate"]
 
-# The 97.5 % point of the standard normal distribution, for a two-sided 95 % interval.
+# The 97.5 % quantile of the standard normal distribution, for a two-sided 95 % interval.
 _Z_95 = 1.959963984540054
 
 
@@ -107,7 +107,7 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
 
 
 def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: float | Tensor = 0.2) -> Tensor:
-    r"""Whether both errors are below their limits, bool :math:`(B,)`. False where an error is NaN.
+    r"""Whether the errors of rotation and translation are both below their limits, bool :math:`(B,)`. False for NaN.
 
     Args:
         errors: the errors of :math:`B` poses.

@@ -27,7 +27,7 @@ from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 
 __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]
 
-# Rows and columns of a camera matrix in the order of the camera model ``PINHOLE`` of COLMAP and PoseLib.
+# Rows and columns of fx, fy, cx and cy in a camera matrix: the parameters of ``PINHOLE`` of COLMAP and PoseLib.
 _PINHOLE = (0, 1, 0, 1), (0, 1, 2, 2)
 
 
@@ -44,15 +44,15 @@ class PeerPose(NamedTuple):
 class PeerSolver(nn.Module):
     r"""A batched layer around a solver of another library. The library solves one problem at a time.
 
-    A subclass is a dataclass that implements :meth:`solve_one`. The fields are the arguments of the constructor. The
-    library gets the pairs that are not padding and have a weight above 0, but not the weights. If no pose is found,
+    A subclass is a dataclass with the arguments of the constructor as fields, and implements :meth:`solve_one`. The
+    library gets the pairs that are not padding and have a weight above 0, but gets no weights. If no pose is found,
     ``ok`` is false, and the pose is the identity. A problem is not solved if it has fewer than three pairs, a negative
     weight, a value that is not finite, or a camera with skew or a focal length of 0.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
     Args:
-        threshold: largest reprojection error of an inlier in pixels. A solver that takes every pair as an inlier has
+        threshold: largest reprojection error, in pixels, of an inlier. A solver that takes every pair as an inlier has
             an infinite threshold.
 
     Raises:
@@ -102,9 +102,9 @@ class PeerSolver(nn.Module):
 
         Returns:
             The :class:`~kornia_pnpnet.result.PnPResult` on the device of the input, without gradients. The dtype is
-            float64 if an input is float64, else float32. A weight is 1 if the library reports the pair as an inlier,
-            else 0. The cost is the mean squared reprojection error in px² of the pairs that the library gets. Errors
-            above the threshold are truncated to the threshold.
+            float64 if an input is float64, else float32. A pair has the weight 1 if the library reports the pair as an
+            inlier, else 0. The cost, in px², is the mean squared reprojection error of the pairs that the library gets.
+            Errors above the threshold are truncated to the threshold.
         """
         size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, mask)
         check_form(["*", "N", "2"], img_points=img_points)  # no bearings
@@ -198,7 +198,7 @@ class _OpenCV(PeerSolver):
     def flag(self) -> int:
         """Return OpenCV's constant for the method."""
         cv2, name = self.library(), self.kind + f"{self.method}".removeprefix(self.kind)
-        usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"  # finds fundamental matrices
+        usable = hasattr(cv2, name) and name != "USAC_FM_8PTS"  # USAC_FM_8PTS finds fundamental matrices
         KORNIA_CHECK(usable, f"OpenCV {cv2.__version__} has no method {self.method} for poses.")
         return int(getattr(cv2, name))
 
@@ -234,12 +234,12 @@ class OpenCVPnP(_OpenCV):
 class OpenCVRansac(_OpenCV, RobustPeer):
     r"""OpenCV's ``solvePnPRansac``, then ``solvePnPRefineLM`` on the inliers, problem by problem.
 
-    The defaults were tuned on ``SyntheticProblems``, where noise of a close world point moves its pixel by 17 px.
+    The defaults were tuned on ``SyntheticProblems``, where the noise of a close world point moves its pixel by 17 px.
     World points with less noise need a lower threshold. With noisy world points, ``method="SQPNP", refine=False``
-    solves more problems and takes several times as long, because SQPnP minimises an object-space error.
+    solves more problems, because SQPnP minimises an object-space error. SQPnP takes several times as long.
 
     Args:
-        threshold: largest reprojection error of an inlier in pixels.
+        threshold: largest reprojection error, in pixels, of an inlier.
         iterations: largest number of RANSAC iterations.
         confidence: RANSAC stops when a sample without outliers was drawn with at least this probability, in (0, 1).
         method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
@@ -295,9 +295,9 @@ class OpenCVUsac(OpenCVRansac):
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
 
-    kornia-rs computes in float32. Its local optimisation is off, because this option does not increase the number of
-    solved ``SyntheticProblems``. For ``threshold`` and its tuning, ``confidence`` and ``seed``, see
-    :class:`OpenCVRansac`.
+    kornia-rs computes in float32. The local optimisation of kornia-rs is off, because it does not increase the number
+    of solved ``SyntheticProblems``. For ``threshold``, ``confidence``, ``seed`` and the tuning of the default
+    threshold, see :class:`OpenCVRansac`.
 
     Args:
         max_iterations: largest number of RANSAC iterations.
@@ -329,10 +329,10 @@ class KorniaRs(RobustPeer):
 class PoseLib(RobustPeer):
     r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
 
-    For ``threshold`` and its tuning, ``confidence`` and ``seed``, see :class:`OpenCVRansac`.
+    For ``threshold``, ``confidence``, ``seed`` and the tuning of the default threshold, see :class:`OpenCVRansac`.
 
     Args:
-        min_iterations: smallest number of RANSAC iterations. PoseLib's default, 1000, is not better for 9 pairs.
+        min_iterations: smallest number of RANSAC iterations. PoseLib's default of 1000 is not better for 9 pairs.
         max_iterations: largest number of RANSAC iterations. A problem without a pose takes this number of iterations.
         progressive_sampling: use PROSAC, which needs pairs that are sorted from the best to the worst.
     """
@@ -350,7 +350,6 @@ class PoseLib(RobustPeer):
         KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")
 
     def _options(self) -> dict[str, Any]:
-        """Return the options under PoseLib's names."""
         names = {"threshold": "max_reproj_error", "confidence": "success_prob"}
         return {names.get(name, name): value for name, value in self.config().items()}
 
@@ -367,11 +366,11 @@ class PoseLib(RobustPeer):
 class PyColmap(RobustPeer):
     r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
 
-    For ``threshold`` and its tuning, ``confidence`` and ``seed``, see :class:`OpenCVRansac`.
+    For ``threshold``, ``confidence``, ``seed`` and the tuning of the default threshold, see :class:`OpenCVRansac`.
 
     Args:
-        loss_scale: scale in pixels of the refinement's Cauchy loss, tuned like ``threshold``. COLMAP's own default
-            of 1 px suits world points with little noise, but solves several per cent fewer ``SyntheticProblems``.
+        loss_scale: scale in pixels of the refinement's Cauchy loss, tuned like ``threshold``. COLMAP's default of 1 px
+            suits world points with little noise, but solves several per cent fewer ``SyntheticProblems``.
         min_iterations: smallest number of RANSAC iterations.
         max_iterations: largest number of RANSAC iterations.
     """

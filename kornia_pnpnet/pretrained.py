@@ -29,7 +29,7 @@ CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 _FINGERPRINT = "sha256"
 # Largest number of bytes that are read from a configuration file. Every valid file is smaller.
 _LARGEST_CONFIG = 2**20
-# Integers up to this value are accepted in every configuration, because tensors of such sizes take little memory.
+# Integers up to this value are accepted in every configuration, because tensors of these sizes take little memory.
 _SMALL = 1000
 
 
@@ -74,7 +74,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     for name, tensor in state.items():
         if not tensor.isfinite().all():
             raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
-    # Refuse integers that exceed the sizes of all tensors, before a module of such a size is built.
+    # Refuse integers that exceed the largest size of a tensor, before a module of such a size is built.
     largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
     entries = [("", config)]
     while entries:
@@ -91,7 +91,7 @@ def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
-    """Find shipped weights of this name, else a local folder, else a repository of the Hugging Face Hub.
+    """Find shipped weights of the given name, else a local folder, else a repository of the Hugging Face Hub.
 
     Raises:
         FileNotFoundError: when no shipped weights, folder or repository has this name.
@@ -140,7 +140,7 @@ class PretrainedMixin(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
-        """Copy the solver with another refinement or other options. Both solvers share all unchanged modules."""
+        """Copy the solver with another refinement or other options. The copy and the solver share unchanged modules."""
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from kornia_pnpnet.result import Pose, PosePrior
 
 __all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Inputs", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
 
-#: Least standard deviation of a pixel, in focal lengths. It keeps the weights of exact pixels finite.
+#: Least standard deviation of a pixel, in focal lengths. This bound keeps the weights of exact pixels finite.
 LEAST_NOISE = 1e-6
 #: Least number of pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
@@ -43,7 +43,7 @@ class State(NamedTuple):
 
     @property
     def zoom(self) -> Tensor:
-        """Logarithm of focal length over ``Problem.focal``, :math:`(B, 1)`; :math:`(B, 0)` for known focal lengths."""
+        """The logarithm of f / ``Problem.focal`` for a focal length f, :math:`(B, 1)`; :math:`(B, 0)` if f is known."""
         return self.camera[:, :1]
 
     @property
@@ -53,11 +53,11 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    r"""The noise of each pair: isotropic standard deviations, and covariances if the caller gave them.
+    r"""The noise of each pair: isotropic standard deviations, and the covariances that the caller gave.
 
     Attributes:
         img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``,
-            this is the sigma of isotropic noise with the same trace, because networks ignore ``img_cov``.
+            ``img`` is the sigma of isotropic noise with the same trace, because networks ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, each entry of shape :math:`(B, N)`. ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.
@@ -90,7 +90,7 @@ class Inputs(NamedTuple):
         intrinsics: in a rig, a camera matrix for each pair, :math:`(B, N, 3, 3)`.
         noise: noise of every pair, NaN where unknown; ``None``: the caller gave no noise.
         rig: the transform from the rig to the camera of each pair.
-        free_focal: range and prior of an unknown focal length in the caller's pixels, see :class:`Problem`.
+        free_focal: range and prior, in the caller's pixels, of an unknown focal length, see :class:`Problem`.
         radial: coefficients of the radial distortion that ``with_found_focal`` estimated and removed from the pixels.
     """
 
@@ -126,7 +126,7 @@ class Linear(NamedTuple):
 
 
 class Term(Protocol):
-    """A prior of the pose or of the camera. A term is a tuple of tensors, and their first dimension is the batch."""
+    """A prior of the pose or of the camera. A term is a tuple of tensors whose first dimension is the batch."""
 
     def linearise(self, state: State) -> Linear:
         """Linearise the term at a state."""
@@ -135,26 +135,25 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty for poses that differ from the prior, added to losses in the search. The unit is an outlier's loss.
+        """Penalty, added to losses in the search, for poses that differ from the prior. The unit is an outlier's loss.
 
         The batch of the poses, for example :math:`(H, B)` or :math:`(P, H)`, broadcasts with the batch of the term.
         """
 
 
 class Problem(NamedTuple):
-    r"""A batch of problems in the solver's frame; made by :class:`~kornia_pnpnet.frame.Normalize`.
+    r"""A batch of problems in the solver's frame, made by :class:`~kornia_pnpnet.frame.Normalize`.
 
     Attributes:
         world_points: points of the (possibly centred and scaled) world, shape :math:`(B, N, 3)`.
-        img_points: pixels of a camera with the focal length ``focal`` and the principal point 0,
-            shape :math:`(B, N, 2)`.
-        weights: weight of each pair, at least 0; 0 for padding, shape :math:`(B, N)`.
-        focal: the focal length in pixels, a scalar for all problems. An unknown focal length has this initial value.
+        img_points: pixels of a camera with focal length ``focal`` and principal point 0, shape :math:`(B, N, 2)`.
+        weights: weight of each pair, at least 0, and 0 for padding, shape :math:`(B, N)`.
+        focal: the focal length in pixels (its initial value if it is unknown), a scalar that all problems share.
         img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
         world_scale: units of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
         usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), else 0, shape :math:`(B, N)`.
         noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown.
-        confidence: the caller's belief that a pair is an inlier, in [0, 1], NaN where unknown, shape :math:`(B, N)`.
+        confidence: the caller's belief, in [0, 1], that a pair is an inlier, NaN where unknown, shape :math:`(B, N)`.
         rig: the transform from the rig to the camera of each pair, :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The pose
             of the problem is then the pose of the rig. ``None``: one camera.
         pose_terms: priors of the pose, such as :class:`~kornia_pnpnet.refine.terms.PoseTerm`.
@@ -190,7 +189,7 @@ class Problem(NamedTuple):
 
     @property
     def camera_terms(self) -> tuple[Term, ...]:
-        """The prior of the camera, if the focal length is unknown, and ``focal_sigma`` or ``radial`` is given."""
+        """The prior of the camera if the focal length is unknown and ``focal_sigma`` or ``radial`` is given."""
         known = self.free_focal is not None and self.free_focal.information is not None
         return (self.free_focal,) if known else ()
 
@@ -205,7 +204,7 @@ class Problem(NamedTuple):
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
     def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays (B, N, 3) of length ``focal`` in the rig's frame, through points on the planes z = 1 of the cameras."""
+        """Rays (B, N, 3) in the rig's frame, of length ``focal``, through points on the planes z = 1 of the cameras."""
         assert self.rig is not None
         rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
         rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
@@ -213,7 +212,7 @@ class Problem(NamedTuple):
 
     def seen_with(self, zoom: Tensor) -> Problem:
         """The same pairs with the known focal length ``focal * exp(zoom)``. ``zoom`` has the shape (B, 1) or (B, 0)."""
-        # All problems share `focal`. Pixels and their noise are therefore divided by the exponential.
+        # Pixels and their noise are divided by exp(zoom), because all problems share `focal`.
         if not zoom.shape[1]:
             return self
         factor = (-zoom).exp()
@@ -234,11 +233,11 @@ class Starts(NamedTuple):
 
     Attributes:
         pose: a coarse pose in the frame of the :class:`Problem`.
-        weights: number of at least 0 by which the weight of each pair is multiplied, shape :math:`(B, N)`.
+        weights: factor, at least 0, that multiplies the weight of each pair, shape :math:`(B, N)`.
         ok: whether a pose was found (degenerate pairs may have no pose), bool, shape :math:`(B,)`; ``None``: all true.
         others: more poses, rotations :math:`(B, S, 3, 3)` and translations :math:`(B, S, 3)`; ``None``: no others.
-        noise: noise of each pair in the units of the problem, without covariances. The initialiser estimates what the
-            caller did not give. ``None``: the initialiser does not estimate noise.
+        noise: noise of each pair in the units of the problem, without covariances. The initialiser estimates the noise
+            that the caller did not give. ``None``: the initialiser does not estimate noise.
         camera: initial camera parameters for all poses, see :class:`State`; ``None``: zeros.
     """
 

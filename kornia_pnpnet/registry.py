@@ -28,9 +28,9 @@ __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 _Peer: TypeAlias = Literal[
     "opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap"
 ]
-# Iterations of the classical robust LM: `_FEW` from another method's pose, `_MANY` from the identity.
+# Iterations of the classical robust LM: `_FEW` for a start from another method's pose, `_MANY` from the identity.
 _FEW, _MANY = 10, 30
-# Number of pairs in a sample of the paper's RANSAC.
+# Number of pairs in each sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
 
 
@@ -41,18 +41,18 @@ def _trained(weights: str, m: int | None = None) -> PnPNet:
 
 
 def _alone(init: Callable[..., nn.Module], **options: Any) -> PnPNet:
-    """A solver that judges another method's pose without refinement."""
+    """A solver that judges the pose of ``init``, but does not refine this pose."""
     refine = RobustWeightedLM(0, damping=1e-6, robustness=0.0, learnable=False)
-    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # only RANSAC depends on the order
+    return PnPNet(init(**options), refine, Normalize(order=init is RANSAC))  # the order of pairs matters to RANSAC only
 
 
 def _paper_lm(m: int) -> RobustWeightedLM:
-    """The classical robust LM of the paper's comparisons: alpha = 1, and every step is accepted."""
+    """The classical robust LM of the paper's comparisons: the exponent alpha is 1, and every step is accepted."""
     return RobustWeightedLM(m, learnable=False, reject_worse=False)
 
 
 def _refined(init: Callable[..., nn.Module], m: int = _FEW, **options: Any) -> PnPNet:
-    """A solver that refines another method's pose by the classical robust LM (the paper's "-LM")."""
+    """A solver that refines the pose of ``init`` by the classical robust LM (the paper's "-LM")."""
     return PnPNet(init(**options), _paper_lm(m), Normalize(order=False))
 
 
@@ -99,8 +99,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Every solver is called as ``solver(world_points, img_points, intrinsics, weights=None, mask=None)`` and returns a
     :class:`~kornia_pnpnet.result.PnPResult`. Solvers of this package take more arguments, see
-    :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. For a type checker, a solver is a ``PnPNet`` unless
-    ``name`` is a literal that names a solver of another library.
+    :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. For a type checker, the result is a ``PnPNet`` unless
+    ``name`` is a literal name of a solver of another library.
 
     Args:
         name: one of :func:`list_solvers`.
@@ -111,8 +111,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
-        The solver as a module in evaluation mode. Its parameters do not require gradients, so that a result has a
-        graph only if an input requires gradients. To train a shipped solver further, load it with
+        The solver as a module in evaluation mode. Its parameters do not require gradients, so that a result has an
+        autograd graph only if an input requires gradients. To train a shipped solver further, load the solver with
         ``PnPNet.from_pretrained``.
 
     Raises:
@@ -136,13 +136,12 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             solver = solver.with_options(**ours)
         return solver.eval().requires_grad_(False)
     except TypeError as error:
-        reason = str(error).rpartition("() ")[2]  # without the name of a function
+        reason = str(error).rpartition("() ")[2]  # drops the name of a function
         raise ValueCheckError(f"Solver {name!r} does not take these options: {reason}.") from error
 
 
 @lru_cache(maxsize=8)
 def _on_device(name: str, device: torch.device) -> nn.Module:
-    """Build a solver once for each name and device."""
     with device:
         return create_solver(name)
 

@@ -92,7 +92,7 @@ class Pose(NamedTuple):
         r"""A pose from a quaternion :math:`(w, x, y, z)`, the order of COLMAP and Kornia.
 
         Args:
-            quaternion: of any length except 0, shape :math:`(B, 4)`.
+            quaternion: quaternion of any length except 0, shape :math:`(B, 4)`.
             translation: shape :math:`(B, 3)`.
         """
         return cls._of_vectors(quaternion_to_rotation_matrix, "quaternion", quaternion, 4, translation)
@@ -258,8 +258,8 @@ class Status(IntEnum):
     PRECISION = 7
     #: Pairs were left out because their ``confidence`` is not in [0, 1], and the other pairs determine no pose.
     CONFIDENCE = 8
-    #: The pose ``init`` was ignored because it is not finite or its determinant is not positive, and no other pose was
-    #: found.
+    #: The pose ``init`` was ignored, and no other pose was found. An ignored ``init`` is not finite, or the determinant
+    #: of its matrix is not positive.
     INIT = 9
 
 
@@ -302,8 +302,8 @@ class PnPResult(NamedTuple):
         weights: final weight of each pair, in the caller's order, shape :math:`(B, N)`.
         cost: robust loss of the pairs and of a prior, divided by the number of pairs, in the unit of the kernel (see
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
-        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, ``intrinsics``, ``dist``
-            and all fields above are finite. These fields then have a gradient only with ``gradient="always"``.
+        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the fields above,
+            ``intrinsics`` and ``dist`` are finite, but have a gradient only with ``gradient="always"``.
         init: the first guess. The first guess of every valid problem has a gradient, even if the refinement failed, so
             that an initialiser can learn from failures.
         status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
@@ -315,9 +315,8 @@ class PnPResult(NamedTuple):
             :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. For one camera, the identity
             replaces an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
-        sigma: standard deviation of a pixel coordinate, estimated from the inliers, in the caller's pixels, shape
-            :math:`(B,)`, without gradient. The estimate includes the noise of the points,
-            converted to pixels at the geometric mean of the depths.
+        sigma: standard deviation of a pixel coordinate in the caller's pixels, estimated from the inliers, shape
+            :math:`(B,)`, without gradient. The noise of points is included, in pixels at the geometric mean depth.
         inliers: which pairs are inliers of the pose, bool, shape :math:`(B, N)`.
     """
 
@@ -336,7 +335,7 @@ class PnPResult(NamedTuple):
     inliers: Tensor = _UNSET
 
     def __repr__(self) -> str:
-        """Five lines: number of ``ok`` problems; median and range of inliers, of sigma, of probability; the pose."""
+        """Five lines: the number of ``ok`` problems; median and range of inliers, sigma and probability; the pose."""
         shown = self.ok, self.status, self.inliers, self.sigma, self.probability, *self.pose
         if not all(type(x) is Tensor and sees_values(x) and x.numel() for x in shown):
             return tuple.__repr__(self)
@@ -379,8 +378,8 @@ class PnPResult(NamedTuple):
         Args:
             world_points: the points of the solver's call.
             img_points: the pixels of the solver's call.
-            intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the ``intrinsics`` of the
-                result replace them.
+            intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the result's ``intrinsics``
+                are used instead.
             noise: further arguments of ``pose_covariance``. The default weights are ``inliers``. If no noise is given,
                 the noise is estimated from the residuals of the inliers (see
                 :func:`~kornia_pnpnet.covariance.shown_noise`). If only noise of the points is given, ``sigma`` is the
@@ -405,7 +404,7 @@ class PnPResult(NamedTuple):
 class Problems(NamedTuple):
     r"""A batch of problems with their true poses. Every data source yields such batches.
 
-    The fields from ``img_sigma`` on are inputs of solvers; for shapes and units see :meth:`PnPNet.forward
+    The fields from ``img_sigma`` on are inputs of solvers. For shapes and units see :meth:`PnPNet.forward
     <kornia_pnpnet.solver.PnPNet.forward>`.
 
     Attributes:
@@ -442,7 +441,7 @@ class Problems(NamedTuple):
     @property
     def known(self) -> dict[str, Any]:
         """The known noise, the confidences and the rig, as keyword arguments of a solver's call."""
-        # All optional fields are such arguments.
+        # All optional fields are arguments of a solver's call.
         return {name: x for name, x in self._asdict().items() if name in self._field_defaults and x is not None}
 
     @property

@@ -38,11 +38,11 @@ from kornia_pnpnet.result import Alternatives, PnPResult, Pose, PosePrior, Statu
 
 __all__ = ["PnPNet"]
 
-# Largest norm of the gradient of a problem's loss with respect to normalised inputs. Usual norms are about 1.
+# Gradients of a problem's loss with respect to normalised inputs are limited to this norm. Usual norms are about 1.
 _LONGEST_GRADIENT = 10.0
-# Number of additional iterations if the focal length starts from a nominal value (see `_with_camera`) or distortion is
-# estimated. With 1000 pairs, fewer iterations do not converge (CameraProblems, seeds 4321, 4322). Only these iterations
-# give the distortion a gradient.
+# Number of additional iterations of the refinement if the focal length starts from a nominal value (see `_with_camera`)
+# or distortion is estimated. With 1000 pairs, fewer iterations do not converge (CameraProblems, seeds 4321 and 4322).
+# Only these iterations give the distortion a gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -90,13 +90,13 @@ class PnPNet(PretrainedMixin):
         effort: ``"adaptive"``: a problem gets further minimal samples if the poses of the initialiser explain too few
             pairs (see :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
             :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
-            the effort is adaptive in evaluation mode if the initialiser estimates the noise and the refinement has
-            iterations. Two more steps depend on the data unless the effort is ``"fixed"``. In evaluation mode, a pose
-            of one camera is compared with other poses (see :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
+            in evaluation mode, the effort is adaptive if the initialiser estimates the noise and the refinement has
+            iterations. Two more steps depend on the data unless the effort is ``"fixed"``. In evaluation mode, poses of
+            single cameras are compared with other poses (see :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
             For rigs and bearings, RANSAC chooses the number of its samples. The effort is always fixed in exported
             graphs, with ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``.
-        gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If the first batches
-            have no such problem, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems. The gradient of each
+        gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If no problem of the
+            first batches is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems. The gradient of a
             problem's loss with respect to its normalised inputs then has a norm of at most 10. To train a network from
             random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8. The views are the problem itself and its rotated or mirrored
@@ -104,8 +104,8 @@ class PnPNet(PretrainedMixin):
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
             The intrinsics of the call then give the principal point, the aspect ratio, and the ratio of the skew to the
             focal length. With ``SetInit`` the refinement starts from the middle of the range of focal lengths. A search
-            with P3P finds the initial focal length if this result is not believed, if another initialiser is used, or
-            if a pose or ``radial`` is given. A problem is not ``ok`` when the standard deviation of log f exceeds 0.15.
+            with P3P follows if the refined pose is not believed. With another initialiser, a given pose, or ``radial``,
+            the search gives the start. A problem is not ``ok`` when the standard deviation of log f exceeds 0.15.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
         radial: number of coefficients of radial distortion, 0 to 2, that are estimated together with an unknown focal
@@ -188,15 +188,14 @@ class PnPNet(PretrainedMixin):
                 vectors of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`; or Kornia's cameras, whose
                 extrinsics are ignored. In a rig, each pair may have its own matrix, shape :math:`(B, N, 3, 3)`. With
-                bearings, ``None`` is allowed, and sigmas and thresholds are then in radians. If intrinsics are given
+                bearings, intrinsics may be ``None``. Sigmas and thresholds are then in radians. If intrinsics are given
                 with bearings, sigmas and thresholds are in pixels at the given focal length.
             weights: weight of each pair for u and v, at least 0, shape :math:`(B, N)`. ``None``: all weights are 1.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
-                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. A matrix that is
-                not exactly a rotation is replaced by the nearest rotation. This also holds for ``prior`` and
-                ``cam_from_rig``. ``init`` is ignored if it is not finite, or if the determinant of its matrix is not
-                positive.
+                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. A matrix of
+                ``init``, ``prior`` or ``cam_from_rig`` that is not exactly a rotation is replaced by the nearest
+                rotation. ``init`` is ignored if it is not finite, or if the determinant of its matrix is not positive.
             img_sigma: standard deviation of the noise on each pixel coordinate, at least 0: a number, or a tensor of
                 shape :math:`(B,)` or :math:`(B, N)` with NaN where unknown. With ``img_sigma`` or ``world_sigma``,
                 residuals and the scales of the refinement's kernel are in standard deviations.
@@ -206,7 +205,7 @@ class PnPNet(PretrainedMixin):
                 :math:`(B, N, 2, 2)`. Give ``img_cov`` or ``img_sigma``, not both.
             world_cov: covariance of the noise of each world point, shape :math:`(B, N, 3, 3)`. Give ``world_cov`` or
                 ``world_sigma``, not both.
-            confidence: the caller's belief that a pair is an inlier, in [0, 1], for example a matcher's score, shape
+            confidence: the caller's belief, in [0, 1], that a pair is an inlier, for example a matcher's score, shape
                 :math:`(B, N)`; NaN where unknown. Values up to 0.001 below 0 or above 1 are rounded to 0 or 1. A pair
                 with any other value outside [0, 1] is left out. Pairs of high confidence are drawn more often for
                 minimal samples. Networks that were trained with confidences take confidences as an input. Confidences
@@ -215,14 +214,14 @@ class PnPNet(PretrainedMixin):
                 term to the cost, and thus affects the refinement and the choice of the best pose. Unless ``init`` is
                 given, the refinement also starts from the prior's pose. ``ok`` and ``probability`` depend on the pairs
                 alone. If the noise is unknown, the refinement with a prior assumes a standard deviation of one pixel.
-            dist: distortion coefficients of Kornia and OpenCV, 4, 5, 8, 12 or 14 numbers, shape :math:`(B, D)` or
+            dist: 4, 5, 8, 12 or 14 distortion coefficients, as in Kornia and OpenCV, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
             fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out. To keep such pixels, pass bearings.
             cam_from_rig: the transform from the frame of a rig (several cameras) to the frame of each pair's camera,
                 :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The solved pose is then the pose of the rig.
-            first_stage_only: return the first guess without refinement (the paper's "Net"), as with ``m=0``.
+            first_stage_only: return the first guess unrefined (the paper's "Net"), like a refiner with ``m=0``.
             gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`. ``None``: the solver's own option.
             alternatives: largest number of alternative poses to return, see
                 :class:`~kornia_pnpnet.result.Alternatives`. The search takes as long as several calls without
@@ -238,9 +237,9 @@ class PnPNet(PretrainedMixin):
                 initialiser was not built for.
             TypeCheckError: for arguments that are not tensors, and for tensors of booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
-            ValueCheckError: when a sigma and a covariance are both given for the pixels or for the points, or when
-                arguments cannot be combined: an unknown focal length with distortion or with a rig, and a rig with
-                alternatives.
+            ValueCheckError: when a sigma and a covariance are both given for the pixels or for the points, when an
+                unknown focal length is combined with distortion or with a rig, or when a rig is combined with
+                ``alternatives``.
         """
         size, inputs = checked_inputs(
             world_points,
@@ -301,33 +300,32 @@ class PnPNet(PretrainedMixin):
             return restore_leading(size, (attempt.result, attempt.frame.undo_starts(attempt.starts)))
 
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
-        """Compile the solver in place with ``torch.compile``: the first stage, an iteration, and the final stage.
+        """Compile the first stage, one iteration and the final stage of the solver in place, with ``torch.compile``.
 
         The first call compiles for some seconds. A new number of pairs, a new dtype, or the first call with gradients
         causes a new compilation. A new batch size causes none. Parts that cannot be compiled run uncompiled after one
-        warning: RANSAC always, and all parts without a C++ compiler or before PyTorch 2.13. A copy of the solver
-        compiles again.
+        warning: RANSAC always, and all parts if there is no C++ compiler or PyTorch is older than 2.13. A copy of the
+        solver compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
             whole: compile the solver with all iterations as one graph of fixed effort. The first call takes longer.
-                Calls with few problems take half the time, because they run less Python code.
+                Calls with few problems then take half the time, because less Python code runs.
         """
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
-        """Solve problems, and find alternatives."""
         inputs, nominal = self._with_camera(inputs)
         attempt = self._attempt(inputs, call, nominal=nominal)
         return self._with_alternatives(attempt, call.alternatives) if call.alternatives else attempt.result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
-        """Set an initial value of an unknown focal length. Return whether it is *nominal*, the middle of the range."""
+        """Initialise an unknown focal length. Return whether the value is *nominal*, the middle of the range."""
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma, self.radial)
-        # A network's poses fit the nominal focal length, but a caller's pose does not. Poses of `find_focal`, which
-        # replace doubted poses, are refined by iterations that ignore the initialiser's weights (`by_residual`).
+        # A network's poses fit the nominal focal length, but a caller's pose does not. `find_focal` replaces doubted
+        # poses. The iterations that refine the new poses ignore the initialiser's weights (`by_residual`).
         given = inputs.init is not None or inputs.prior is not None
         free = trait(self.init, "estimates_noise") and self.refine.by_residual and not given
         if free and not self.radial:
@@ -367,7 +365,6 @@ class PnPNet(PretrainedMixin):
         return _Attempt(problem, frame, starts, refined, result)
 
     def _propose(self, inputs: Inputs, call: _Call, search_follows: bool) -> tuple[Problem, Frame, Starts]:
-        """Normalise the inputs and propose poses."""
         problem, frame = self.normalize(*inputs[:5], inputs.noise, inputs.confidence, inputs.rig)
         init = inputs.init
         if call.always:
@@ -439,7 +436,7 @@ class PnPNet(PretrainedMixin):
 
     @torch.no_grad()
     def _with_alternatives(self, attempt: _Attempt, most: int) -> PnPResult:
-        """Add to the result the other poses that explain the pairs nearly as well."""
+        """Add to the result other poses that explain the pairs nearly as well as the result's pose."""
         frame, result, problem = attempt.frame, attempt.result, attempt.problem.seen_with(attempt.refined.state.zoom)
         found = find_alternatives(self.refine, problem, attempt.starts, frame.apply(result.pose), frame.valid, most)
         poses = frame.undo(Pose(found.rotation, found.translation))

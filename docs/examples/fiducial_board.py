@@ -84,11 +84,9 @@ def main() -> None:
             with torch.no_grad():
                 result = solver(world, img, torch.from_numpy(CAMERA), mask=mask)
             away, angle = pose_error(result.pose, truth)
-            runs[name][f"{share:.0%}"] = {
-                "median_mm": 1000.0 * away[result.ok].median().item(),
-                "median_deg": angle[result.ok].median().item(),
-                "within_10_mm": (result.ok & (away < 0.01)).double().mean().item(),
-            }
+            median_mm, median_deg = (x[result.ok].median().item() for x in (1000.0 * away, angle))
+            within = (result.ok & (away < 0.01)).double().mean().item()
+            runs[name][f"{share:.0%}"] = {"median_mm": median_mm, "median_deg": median_deg, "within_10_mm": within}
             paths[name] = centre(result.pose)
     write(options.out / "fiducial_board.json", frames=len(seen), runs=runs)
     figure = make_figure(8.6, 3.4)

@@ -2,7 +2,7 @@
 
 Cameras circle over a scene and match what they see with the map so far. A share of the matches is wrong, and points
 triangulated from wrong matches lie anywhere, some of them far away. The program registers one image after the other
-and triangulates new points, with `cv2.solvePnPRansac` or with `pnpnet-set`; both lines stand in :data:`REGISTER`. In
+and triangulates new points, with `cv2.solvePnPRansac` or with `pnpnet-set`; both stand in :data:`REGISTER`. In
 the end all images are registered again to the whole map. Writes `incremental_map.json` to `--out`.
 """
 
@@ -24,10 +24,7 @@ PIXEL_NOISE, THRESHOLD = 1.0, 6.0  # px
 SEED = 20_261_123
 
 #: What registers images, from world points (B, N, 3), pixels (B, N, 2), the camera and a mask of the matches.
-REGISTER: dict[str, nn.Module] = {
-    "cv2.solvePnPRansac": opencv(THRESHOLD),
-    "pnpnet-set": create_solver("pnpnet-set"),
-}
+REGISTER: dict[str, nn.Module] = {"cv2.solvePnPRansac": opencv(THRESHOLD), "pnpnet-set": create_solver("pnpnet-set")}
 
 
 def draw_scene(wrong: float, index: int) -> tuple[Pose, Tensor]:

@@ -84,8 +84,7 @@ def learn(solve: Solve, steps: int) -> dict[str, Any]:
         loss = torch.where(counts, loss / (1.0 + 5.0 * loss), 0.0).sum() / counts.sum().clamp(min=1)
         optimizer.zero_grad()
         loss.backward()
-        gradient = offsets.grad
-        if gradient is None or not gradient.isfinite().all():
+        if not offsets.grad.isfinite().all():
             lost += 1
             continue
         torch.nn.utils.clip_grad_norm_([offsets], 1.0)

@@ -30,6 +30,7 @@ from torch.distributions import MultivariateNormal
 from torch.nn import functional
 
 from kornia_pnpnet import PnPResult, Pose, create_solver, heatmap_keypoints
+from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.evaluation.plots import BLUE, ORANGE, VERMILION, make_figure, save, themed
 
 SIZE, FOCAL, BATCH = 64, 90.0, 32
@@ -87,7 +88,7 @@ def draw(seed: int, index: int, batch: int = BATCH, *, motion: bool = False) -> 
     images, hit = render(pose)
     background = functional.interpolate(uniform(batch, 3, 5, 5), (SIZE, SIZE), mode="bicubic", align_corners=True)
     images = torch.where(hit[:, None], images, background)
-    pixels, visible = project(pose, KEYPOINTS), outside(pose)
+    pixels, visible = reproject(KEYPOINTS, CAMERA, pose), outside(pose)
     visible &= ((pixels > 0) & (pixels < SIZE - 1)).all(-1)
     row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
     for _ in range(0 if motion else 3):
@@ -108,11 +109,6 @@ def outside(pose: Pose) -> Tensor:
     eye = -(pose.translation[:, None] @ pose.rotation) / HALF  # (B, 1, 3)
     on = (KEYPOINTS / HALF).abs() > 1.0 - 1e-6
     return (on & (eye * (KEYPOINTS / HALF) > 1.0)).any(-1)
-
-
-def project(pose: Pose, points: Tensor) -> Tensor:
-    """Pixels (B, K, 2) of points of the box."""
-    return pose.camera(CAMERA).project(points.expand(len(pose.rotation), -1, -1))
 
 
 def render(pose: Pose) -> tuple[Tensor, Tensor]:
@@ -344,7 +340,7 @@ def plot_overlays(networks: dict[str, Keypoints], path: Path) -> None:
     for row, (name, network) in zip(figure.subplots(2, 6), networks.items(), strict=True):
         pixels, sigma = network(problem.images)
         result = solve(solver, pixels, sigma if name == END else None)
-        found, truth = (project(pose, KEYPOINTS) for pose in (result.pose, problem.pose))
+        found, truth = (reproject(KEYPOINTS, CAMERA, pose) for pose in (result.pose, problem.pose))
         for i, axes in enumerate(row):
             axes.imshow((problem.images[i] + 0.5).clamp(0, 1).permute(1, 2, 0))
             for corners, colour in ((truth, "white"), (found, BLUE if name == END else ORANGE)):
@@ -371,12 +367,10 @@ def main() -> None:
     if options.covariances:
         write(options.out / "keypoint_covariances.json", **results)
         return
-
-    def total(name: str, key: str) -> float:
-        return sum(found[name][key] for found in seeds.values())
-
-    keys, others = seeds["0"][WITHOUT_SIGMA], (name for name in WAYS if name != END)
-    results["times_lower"] = {name: {key: total(name, key) / total(END, key) for key in keys} for name in others}
+    keys = seeds["0"][WITHOUT_SIGMA]
+    totals = {name: {key: sum(found[name][key] for found in seeds.values()) for key in keys} for name in WAYS}
+    end_to_end = totals.pop(END)
+    results["times_lower"] = {name: {key: x[key] / end_to_end[key] for key in keys} for name, x in totals.items()}
     write(options.out / "keypoint_pipeline.json", **results)
     plot_errors(results, options.out / "keypoint_pipeline.png")
     plot_overlays(runs[-1][1], options.out / "keypoint_pipeline_overlays.png")

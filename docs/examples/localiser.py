@@ -34,6 +34,7 @@ from kornia_pnpnet import PnPResult, Pose, create_solver
 from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.evaluation.plots import BLUE, make_figure, save, themed
+from kornia_pnpnet.peers import PyColmap
 
 LONGEST = 1600  # pixels; larger images are shrunk for the features
 EVERY = 5  # every fifth image of a model is a query
@@ -195,18 +196,16 @@ def solve(solver: nn.Module, photos: Sequence[Photo], chosen: Sequence[Matches],
 
 
 def solve_by_colmap(photos: Sequence[Photo], matches: Sequence[Matches]) -> tuple[Pose, Tensor]:
-    """COLMAP's estimator as hloc calls it: a threshold of 12 px and default options. Poses, and which were found."""
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = 12.0
-    options.ransac.random_seed = 0
-    found = []
-    for photo, pairs in zip(photos, matches, strict=True):
-        (fx, _, cx), (_, fy, cy), _ = photo.intrinsics.tolist()
-        camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[fx, fy, cx, cy])
-        points = pairs.img_points.numpy(), pairs.world_points.numpy()
-        found.append(pycolmap.estimate_and_refine_absolute_pose(*points, camera, options))
-    matrices = torch.tensor(np.array([x["cam_from_world"].matrix() if x else np.eye(3, 4) for x in found]))
-    return Pose(matrices[..., :3], matrices[..., 3]), torch.tensor([x is not None for x in found])
+    """COLMAP's estimator with its default options, as hloc calls it. Poses, and which were found."""
+    solver = PyColmap(threshold=12.0, loss_scale=1.0, confidence=0.99999)
+    found = [
+        solver.solve_one(pairs.world_points.numpy(), pairs.img_points.numpy(), photo.intrinsics.numpy())
+        for photo, pairs in zip(photos, matches, strict=True)
+    ]
+    poses = [(x.rotation, x.translation) if x else (np.eye(3), np.zeros(3)) for x in found]
+    return Pose(*(torch.tensor(np.array(x)) for x in zip(*poses, strict=True))), torch.tensor(
+        [x is not None for x in found]
+    )
 
 
 def errors(pose: Pose, found: Tensor, photos: Sequence[Photo], metre: float) -> list[dict[str, float] | None]:

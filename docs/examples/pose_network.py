@@ -12,6 +12,7 @@ from shared import command, write
 from torch import Tensor, nn
 
 from kornia_pnpnet import Pose, create_solver, monte_carlo_pose_loss, pose_errors
+from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.data.draws import batch_generator, random_poses
 from kornia_pnpnet.losses import pose_distances
 
@@ -25,17 +26,12 @@ COLOURS = torch.tensor([corner[k:] + corner[:k] for corner in CORNERS for k in r
 BLOB, NOISE = 1.5, 0.05  # radius of a keypoint's blob in pixels, and standard deviation of the noise of the image
 
 
-def keypoints_of(pose: Pose) -> Tensor:
-    """The true pixels of the keypoints, (B, N, 2): data of the images, no labels."""
-    return pose.camera(CAMERA).project(SHAPE.expand(len(pose.rotation), -1, -1))
-
-
 def draw(index: int, count: int) -> tuple[Tensor, Pose]:
     """Images (B, 3, 64, 64) of coloured blobs, in any rotation, and their poses."""
     generator = batch_generator(SEED, 1 + index)
     rotation = random_poses(count, generator, max_angle=torch.pi).rotation.float()
     shift = 0.2 * torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0.0, 15.0])
-    u, v = keypoints_of(Pose(rotation, shift))[..., None].unbind(2)  # (B, N, 1)
+    u, v = reproject(SHAPE, CAMERA, Pose(rotation, shift))[..., None].unbind(2)  # (B, N, 1)
     cells = torch.arange(SIZE)
     rows, columns = (torch.exp(-0.5 * ((cells - x) / BLOB).square()) for x in (v, u))  # (B, N, 64)
     images = (rows.mT[:, None] * COLOURS.T[:, None]) @ columns[:, None]
@@ -72,7 +68,7 @@ def train(steps: int, seed: int) -> list[dict[str, Any]]:
                 pixels, sigma = network(test_images)
                 found = solver(SHAPE.expand(TEST, -1, -1), pixels, CAMERA, img_sigma=sigma)
             errors = [error.median().item() for error in pose_errors(found.pose, test_poses)]
-            off = (pixels - keypoints_of(test_poses)).norm(dim=-1).median().item()
+            off = (pixels - reproject(SHAPE, CAMERA, test_poses)).norm(dim=-1).median().item()
             ok = found.ok.float().mean().item()
             curve.append({"step": step, "ok": ok, "rotation_deg": errors[0], "translation": errors[1], "pixels": off})
             print(", ".join(f"{name} {value:.3g}" for name, value in curve[-1].items()), flush=True)

@@ -7,7 +7,7 @@ clients that call the solver themselves, and with PyTorch's default number of th
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
@@ -41,11 +41,8 @@ class Server:
         torch.set_grad_enabled(False)
         while True:
             batch = [self.waiting.get()]
-            while len(batch) < self.most:
-                try:
-                    batch.append(self.waiting.get_nowait())
-                except Empty:
-                    break
+            while len(batch) < self.most and not self.waiting.empty():  # nobody else takes problems
+                batch.append(self.waiting.get())
             world, img, cameras = zip(*(pairs for pairs, _ in batch), strict=True)
             mask = pad_sequence([torch.ones(len(x), dtype=torch.bool) for x in world], batch_first=True)
             padded = (pad_sequence(list(x), batch_first=True) for x in (world, img))

@@ -225,9 +225,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = command(__doc__)
     parser.add_argument("--sequence", type=Path, help="folder of an RGB-D sequence of the TUM benchmark")
-    parser.add_argument(
-        "--intrinsics", type=float, nargs=4, help=f"fx fy cx cy in pixels (default: of freiburg1, {FREIBURG1})"
-    )
+    parser.add_argument("--intrinsics", type=float, nargs=4, help="fx fy cx cy in pixels (default: of freiburg1)")
     parser.add_argument("--frames", type=int, default=100, help="of the sequence that is rendered")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)  # times are those of one thread

@@ -471,10 +471,8 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
     return save(figure, path)
 
 
-_RAW_LOOKS = {  # a solver with more inputs keeps its colour and has another marker and line
-    "+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"},
-    "=fixed": {"marker": "^"},
-}
+# A solver with more inputs keeps its colour and has another marker and line.
+_RAW_LOOKS = {"+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"}, "=fixed": {"marker": "^"}}
 
 
 def grouped(rows: Iterable[Mapping[str, Any]], *keys: str) -> dict[Any, list[Mapping[str, Any]]]:
@@ -524,7 +522,6 @@ def plot_real_matches(
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Draw the figures of results files and print their paths."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", metavar="FILE", nargs="+", type=Path, help="results (JSON) or a sweep's summary.csv")
     parser.add_argument("--out", metavar="FOLDER", default="outputs/figures", help="default: outputs/figures")

@@ -18,6 +18,13 @@ than an hour on one core, and continues where it was stopped::
     python train.py -m experiment=kernels $SHORT
     python train.py -m experiment=sweep threads=1 hydra.sweep.dir=outputs/sweep resume=true
     python train.py -m experiment=capacity validation_size=5000 hydra.sweep.dir=outputs/capacity resume=true
+
+The trainings of ``distribution.json`` take minutes::
+
+    RUN="train.py model.n=9 model.m=5 train.updates=6000"
+    python $RUN data=mixed name=mixed hydra.run.dir=outputs/distribution/mixed
+    python $RUN data=paper name=paper hydra.run.dir=outputs/distribution/paper
+    python docs/results/make.py compare --runs outputs/distribution/mixed outputs/distribution/paper
 """
 
 import argparse
@@ -34,9 +41,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, default=scenes, help="folder of the scenes (default: %(default)s)")
     parser.add_argument("--synthetic-count", type=int, default=5000, help="problems of a synthetic set")
     parser.add_argument("--real-count", type=int, default=1000, help="problems of a scene")
-    parser.add_argument(
-        "--runs", type=Path, nargs="+", help="for compare: folders of the runs `mixed` and `paper`; for ship: all runs"
-    )
+    parser.add_argument("--runs", type=Path, nargs="+", help="folders: `mixed` and `paper` for compare, all for ship")
     arguments = parser.parse_args()
     if arguments.step == "measure":
         measure(arguments.scenes, arguments.synthetic_count, arguments.real_count, arguments.only)

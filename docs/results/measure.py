@@ -49,21 +49,16 @@ UNTUNED = (
     *("opencv-epnp", "opencv-sqpnp"),
 )
 _PIXELS: dict[str, Sequence[float]] = {"threshold": (1.0, 2.0, 5.0, 10.0, 20.0, 35.0, 50.0, 80.0, 120.0)}
+_TWO_THRESHOLDS = {"threshold": (1.0, 2.0, 3.0, 5.0, 10.0), "world_threshold": (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)}
 #: Threshold methods by the name on the page: the solver, and the values of its options that tuning tries.
 #: ``p3p-ransac`` has one threshold in pixels like the peers, ``p3p-ransac-noise`` also one for noise of the world
 #: points. OpenCV's RANSAC once with its usual options (AP3P, refined) and once with the best options that we found.
 TUNED: dict[str, tuple[str, dict[str, Sequence[float]]]] = {
-    "ransac-epnp-lm": ("ransac-epnp-lm", _PIXELS),
-    "p3p-ransac": ("p3p-ransac", _PIXELS),
-    "p3p-ransac-noise": (
-        "p3p-ransac",
-        {"threshold": (1.0, 2.0, 3.0, 5.0, 10.0), "world_threshold": (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)},
-    ),
+    **{name: (name, _PIXELS) for name in ("ransac-epnp-lm", "p3p-ransac")},
+    "p3p-ransac-noise": ("p3p-ransac", _TWO_THRESHOLDS),
     "opencv-ransac": ("opencv-ransac", _PIXELS),
     "opencv-ransac-sqpnp": ("opencv-ransac:method=SQPNP,refine=false", _PIXELS),
-    "opencv-usac": ("opencv-usac", _PIXELS),
-    "poselib": ("poselib", _PIXELS),
-    "pycolmap": ("pycolmap", _PIXELS),
+    **{name: (name, _PIXELS) for name in ("opencv-usac", "poselib", "pycolmap")},
 }
 PEERS = ("opencv-ransac", "opencv-ransac-sqpnp", "opencv-usac", "poselib", "pycolmap")
 ROBUST = ("p3p-ransac", "p3p-ransac-noise", *PEERS)
@@ -113,7 +108,6 @@ class FromTheTruth(nn.Module):
         self.config, self.solver = solver.config(), solver
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
-        """Refine the true poses."""
         return self.solver(*problems[:3], init=problems.pose)
 
 

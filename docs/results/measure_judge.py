@@ -111,22 +111,22 @@ def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
         self: RobustWeightedLM, plan: Any, now: Any, found: Any = None, odds: Tensor | None = None
     ) -> Any:
         refined = judge(self, plan, now, found, odds)
-        against_rivals = torch.ones_like(refined.probability) if odds is None else odds.sigmoid()
+        factor = evidence.within_limits(sigmas[-1]) * (1.0 if odds is None else odds.sigmoid())
         variables = torch.stack(evidence.clipped(refined.evidence.log_ratio, sigmas[-1]), -1)
-        seen.append((variables.double(), refined.probability > 0, against_rivals.double()))
+        seen.append((variables.double(), refined.probability > 0, factor.double()))
         return refined
 
     patch = mock.patch.object
     with patch(evidence, "pose_sigma", watched_sigma), patch(RobustWeightedLM, "judge", watched_judge):
         result = solver(**kind.inputs)
-    variables, usable, against_rivals = (torch.cat(x) for x in zip(*seen, strict=True))
+    variables, usable, factor = (torch.cat(x) for x in zip(*seen, strict=True))
     near = right = torch.zeros_like(result.ok)
     if kind.truth is not None:
         turn, shift = errors(result.pose, kind.truth)
         shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
     found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right, "usable": usable}
-    return {**found, "variables": variables, "against_rivals": against_rivals}
+    return {**found, "variables": variables, "factor": factor}
 
 
 def errors(pose: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
@@ -144,17 +144,17 @@ def rates(row: dict[str, Tensor]) -> dict[str, Any]:
 def fit_law(rows: list[dict[str, Tensor]]) -> list[float]:
     """Fit the law by maximum likelihood; every kind counts the same. Poses that fail a test are left out.
 
-    The probability of "near" is that of the law, multiplied by the probability that no rival is the right pose.
+    The probability of "near" is that of the law, multiplied by the probabilities of a small error and of no rival.
     """
-    parts = [tuple(row[key][row["usable"]] for key in ("variables", "against_rivals", "near")) for row in rows]
-    variables, against_rivals, near = (torch.cat(x) for x in zip(*parts, strict=True))
+    parts = [tuple(row[key][row["usable"]] for key in ("variables", "factor", "near")) for row in rows]
+    variables, factor, near = (torch.cat(x) for x in zip(*parts, strict=True))
     weight = torch.cat([torch.full(x[1].shape, 1.0 / len(row["near"])) for x, row in zip(parts, rows, strict=True)])
     law = torch.zeros(3, dtype=torch.double, requires_grad=True)
     optimiser = torch.optim.LBFGS([law], max_iter=1000, tolerance_change=1e-12, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        probability = torch.sigmoid(law[0] + variables @ law[1:]) * against_rivals
+        probability = torch.sigmoid(law[0] + variables @ law[1:]) * factor
         value = functional.binary_cross_entropy(probability, near.double(), weight.double(), reduction="sum")
         value.backward()
         return value
@@ -181,7 +181,7 @@ PARTS: dict[str, tuple[Any, str, Any]] = {
     "rival of larger noise": (alternatives, "_GAP", -math.inf),
     "rival of the search": (alternatives, "_APART", math.inf),
     "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
-    "limit of the pose's standard deviation": (evidence, "_OPEN", math.inf),
+    "standard deviation of the pose": (evidence, "within_limits", torch.ones_like),
     "limit of the noise": (evidence, "_MOST_NOISE", math.inf),
     "points off a line": (evidence, "_leave_a_line", lambda world_points, inliers: inliers.any(-1)),
 }

@@ -22,7 +22,6 @@ _KEPT = 0.5  # weights above this count as inliers, as on the page about OpenCV
 _HALF_VIEW = 0.31  # tangent of half the field of view that is drawn
 _PHOTO = Path(__file__).with_name("house.jpg")
 _CAMERA = 4.0  # metres; length of a drawn camera
-_VIEWPOINT = {"elev": 20.0, "azim": -60.0}  # degrees
 
 # A house, 8 m by 6 m and 7 m high, with a gable roof: x to the right, y down, z away; corners in metres.
 _CORNERS = torch.tensor(
@@ -50,8 +49,8 @@ def _in_camera(points: Tensor) -> Tensor:
     return points @ (down @ around).mT + _PLACE
 
 
-def _seen_edges() -> Tensor:
-    """The ends of the edges in sight, of the house, its windows and its door, shape (E, 2, 3)."""
+def _house_points(batch_size: int, n: int, generator: torch.Generator) -> Tensor:
+    """Points on the edges in sight of house, windows and door, see :class:`kornia_pnpnet.data.PointPrior`."""
     ends = []
     for front, openings in enumerate(_OPENINGS):
         for centre, bottom, top in openings:
@@ -59,12 +58,7 @@ def _seen_edges() -> Tensor:
             outline = (left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)
             corners = [(x, -up, -3.0) if front else (4.0, -up, x) for x, up in outline]
             ends += list(itertools.pairwise(corners))
-    return torch.cat((_IN_SIGHT, torch.tensor(ends, dtype=torch.float64)))
-
-
-def _house_points(batch_size: int, n: int, generator: torch.Generator) -> Tensor:
-    """Points on edges of the house, see :class:`kornia_pnpnet.data.PointPrior`."""
-    edges = _seen_edges()
+    edges = torch.cat((_IN_SIGHT, torch.tensor(ends, dtype=torch.float64)))  # (E, 2, 3)
     edges = edges[torch.randint(len(edges), (batch_size, n), generator=generator)]  # (B, n, 2, 3)
     along = torch.rand((batch_size, n, 1), generator=generator, dtype=torch.float64)
     return _in_camera(torch.lerp(edges[..., 0, :], edges[..., 1, :], along))
@@ -122,7 +116,7 @@ def plot_problem(path: str | Path) -> Path:
     space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     space.set_box_aspect((high - low).tolist(), zoom=1.45)
     space.set_axis_off()
-    space.view_init(**_VIEWPOINT)
+    space.view_init(elev=20.0, azim=-60.0)
     angle, shift = errors.rotation_error_deg.item(), 100.0 * errors.translation_error.item()
     space.set_title(f"pose: {angle:.2f}° and {math.ceil(shift)} cm from the truth", fontsize=11)
     return save(figure, path)

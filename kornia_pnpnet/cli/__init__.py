@@ -1,6 +1,6 @@
-"""The command ``pnpnet``. Each subcommand is a module: its docstring is the help, and ``run`` returns the exit code.
+"""The command ``pnpnet``. Each subcommand is a module: the module's docstring is the help of the subcommand.
 
-The modules import PyTorch inside ``run``, so that errors in arguments appear at once.
+A module's ``run`` returns the exit code. PyTorch is imported inside ``run``, so that bad arguments fail at once.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ COMMANDS = {"solve": solve, "evaluate": evaluate, "export": export, "list": list
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Build the parser of ``pnpnet``; the parsed ``command`` is a key of :data:`COMMANDS`."""
+    """Build the parser of ``pnpnet``. The parsed ``command`` is a key of :data:`COMMANDS`."""
     parser = OneLineParser(prog="pnpnet", description="Camera poses from 2D-3D matches, even when some are wrong.")
     parser.add_argument("--version", action="version", version=f"pnpnet {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
@@ -31,7 +31,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line with the arguments ``argv``, or with those of the process.
+    """Run the command line with the arguments ``argv``, or with the arguments of the process.
 
     Returns:
         The exit code: 0 for success, 1 when ``solve`` found no pose, 2 for bad input, 130 after an interruption.

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-# Largest standard deviation of the logarithm of the focal length for `--focal`. A larger number must be a focal length
-# in pixels.
+# Largest standard deviation of log(focal length) for `--focal`. A larger number must be a focal length in pixels.
 _MOST_SIGMA = 3.0
 
 #: Names of synthetic data for ``--data``.
@@ -36,7 +35,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def _checked(read: Callable[[str], _T], fits: Callable[[_T], bool], expected: str) -> Callable[[str], _T]:
-    """Make a parser that applies ``read`` and refuses values for which ``fits`` is false."""
+    """Make a parser that applies ``read``, and refuses values for which ``fits`` returns false."""
 
     def parse(text: str) -> _T:
         with suppress(ValueError):

@@ -20,7 +20,7 @@ _COLUMNS = ("X", "Y", "Z", "u", "v")
 
 
 class ImageCorrespondences(NamedTuple):
-    """The correspondences of one image, in float64, or in float32 if all arrays of the file are float32."""
+    """The correspondences of one image, in float32 if all arrays of the file are in float32, else in float64."""
 
     world_points: Tensor  # (N, 3)
     img_points: Tensor  # pixels, (N, 2)
@@ -28,7 +28,7 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort pixels (``kornia_pnpnet.data.colmap.undistort``). Pixels that have no solution get the weight 0."""
+        """Undistort pixels with ``kornia_pnpnet.data.colmap.undistort``. A pixel without a solution gets weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -62,7 +62,7 @@ def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
-    """Read CSV with the columns ``X,Y,Z,u,v`` and optionally ``weight``, or NPZ with arrays named like the fields.
+    """Read a CSV file (columns ``X,Y,Z,u,v``, optionally ``weight``) or an NPZ file (arrays named like the fields).
 
     Raise ``InputError`` for fewer than three correspondences, a missing column or array, or an invalid number.
     """
@@ -95,7 +95,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
         raise InputError(path, f"world_points of {arrays['world_points'].shape} are many problems: pass --batch")
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     arrays.setdefault("weights", np.ones(count, np.float32))
-    # A file of float32 is solved in float32, so that the solver detects points for which float32 has too few digits.
+    # A file of float32 arrays is solved in float32, so that the solver detects points that need more digits.
     dtype = np.float32 if np.result_type(np.float32, *arrays.values()) == np.float32 else np.float64
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
     tensors = {}
@@ -114,7 +114,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the named arrays. Raise ``InputError`` if ``world_points`` or ``img_points`` is missing."""
+    """Read the named arrays of an NPZ file. Raise ``InputError`` if ``world_points`` or ``img_points`` is missing."""
     try:
         arrays = read_npz(path, names)
     except ValueError as error:

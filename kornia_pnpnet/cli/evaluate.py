@@ -1,7 +1,7 @@
 """Compare solvers on the same problems.
 
 The solvers run in one thread. Their results are printed as a table and written to a results file. The same command
-continues an interrupted evaluation. With more solvers, data, n or outliers it adds their rows to the results file.
+continues an interrupted evaluation. A command with more solvers, data, n or outliers adds rows to the results file.
 
   pnpnet evaluate --solver pnpnet-n9 opencv-ransac:threshold=12 --data path/to/colmap --outliers none,2
   pnpnet evaluate --n 6,9,20,50 --outliers none,uniform,30%
@@ -15,7 +15,7 @@ from pathlib import Path
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate the solvers; print the table and the path of the results."""
+    """Evaluate the solvers, and print the table and the path of the results."""
     import torch
 
     from kornia_pnpnet.evaluation import comparison, format_table, load_results

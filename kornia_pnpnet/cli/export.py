@@ -1,7 +1,7 @@
 """Write a solver as an ONNX model or as a package that is compiled ahead of time.
 
-The suffix of the file decides. ONNX Runtime runs a model (.onnx) without PyTorch. A package (.pt2) loads without
-compiling, in Python and in C++ with libtorch; it runs on CPUs like the one that compiled it.
+The suffix of the file selects the format. ONNX Runtime runs a model (.onnx) without PyTorch. A package (.pt2) loads
+without compiling, in Python and in C++ with libtorch. A package runs on CPUs like the CPU that compiled it.
 
   pnpnet export pnpnet-set.onnx
   pnpnet export pnpnet-n9.pt2 --solver pnpnet-n9 --batch 1

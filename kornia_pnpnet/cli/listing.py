@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-#: Descriptions of solvers by the start of their names. The longest matching key applies.
+#: Descriptions of solvers by the start of a solver's name. The longest matching key applies.
 _WHAT = {
     "pnpnet-set": "network over any number of pairs, then learned LM: the default",
     "pnpnet-n": "the paper's network for that number of pairs, then learned LM; for cameras near the world's axes",
@@ -29,7 +29,7 @@ _WHAT = {
 
 
 def run(_: argparse.Namespace) -> int:
-    """Print the description of each solver, and the package that must be installed, if any."""
+    """Print the description of each solver, and the missing package if the solver needs one."""
     from kornia_pnpnet import list_solvers, shipped_weights
     from kornia_pnpnet.core.extras import how_to_install
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package

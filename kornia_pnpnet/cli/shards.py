@@ -24,7 +24,7 @@ __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 #: Formats of shards.
 SUFFIXES = (".npz", ".parquet")
 
-# Key in the metadata of a results file. The value has the name of the solver and the digest of its parameters.
+# Key in the metadata of a results file. The value holds the solver's name and the digest of the solver's parameters.
 _SOLVER = b"kornia_pnpnet.solver"
 # Largest number of values that are read from a Parquet file at once: 256 MB in float64.
 _NUMBERS_AT_ONCE = 2**25
@@ -53,15 +53,15 @@ def solve_shards(
     r"""Solve shards of problems one after the other. The results of the shard ``part.*`` go to ``part.parquet``.
 
     A Parquet shard has one problem per row and the columns of :class:`~kornia_pnpnet.arrow.Solve`. An NPZ shard is read
-    as a whole. Its arrays have the same names: ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and optionally
-    ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma`` and ``world_sigma``, each (), (B,) or (B, N).
+    as a whole. Its arrays have the names of these columns: ``world_points`` (B, N, 3), ``img_points`` (B, N, 2) and
+    optionally ``intrinsics`` (3, 3) or (B, 3, 3), ``weights`` (B, N), ``img_sigma`` and ``world_sigma``. Both sigmas
+    have the shape (), (B,) or (B, N).
 
-    Only complete results files appear. A repeated call skips the shards that have results. Shards that cannot
-    be read are reported.
+    A results file appears only when it is complete. A repeated call skips shards that have results.
 
     Args:
         solve: the solver.
-        sources: shards, or folders of shards.
+        sources: shards, or folders of shards. The report names the shards that cannot be read.
         out: folder of the results. None of the shards may be in this folder.
         name: name of the solver. Results files store this name and the digest of the solver's parameters.
         batch: largest number of problems that are read and solved at once.
@@ -69,8 +69,8 @@ def solve_shards(
         progress: show a progress bar if stderr is a terminal and tqdm is installed.
 
     Raises:
-        InputError: when there is no shard, when two results would have the same name, when ``out`` is the folder of a
-            shard, or when a shard has results of another solver.
+        InputError: when there is no shard, when two shards would have results of the same name, when ``out`` is the
+            folder of a shard, or when a shard has results of another solver.
         OSError: when the results cannot be written.
     """
     parameters = digest(*chain.from_iterable(sorted(solve.solver.state_dict().items())))
@@ -96,7 +96,7 @@ def solve_shards(
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
-    """Map the stem of each shard's name to its path. Shards of a folder are sorted by name."""
+    """Map the stem of each shard's name to the path of the shard. Shards of a folder are sorted by name."""
     shards: dict[str, Path] = {}
     endings = " or ".join(SUFFIXES)
     for source in map(Path, sources):
@@ -157,7 +157,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
     """Yield tables of at most ``batch`` rows from a Parquet file. An empty file yields one empty table."""
     try:
-        # With pre_buffer, Arrow would read the whole file ahead. Without buffer_size, it would read whole row groups.
+        # With pre_buffer, Arrow would read the whole file ahead; without buffer_size, it would read whole row groups.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
             groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
             numbers = [sum(x.column(i).num_values for i in range(x.num_columns)) // max(x.num_rows, 1) for x in groups]

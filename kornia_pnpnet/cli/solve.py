@@ -1,7 +1,7 @@
 """Find the pose of one image, or of many problems in files.
 
 The pose of one image, x_cam = R x_world + t, is printed as a table on a terminal, and as JSON into a pipe or with
---json. Standard deviations follow from the inliers' residuals; those of the rotation are about the camera's axes.
+--json. Standard deviations follow from the inliers' residuals. A rotation's deviations are about the camera's axes.
 
   pnpnet solve matches.csv --intrinsics 3400,3400,3024,2016 --plot pose.png
 
@@ -9,10 +9,10 @@ With an unknown focal length, pass 1,1 and the principal point, which is usually
 
   pnpnet solve matches.csv --focal unknown --intrinsics 1,1,3024,2016
 
-With --batch, files of many problems are solved in bounded memory and their poses are written to files. The same command
-continues where it was stopped. The files, called shards, are NPZ files with world_points (B, N, 3), img_points
-(B, N, 2) and optionally weights, intrinsics, img_sigma and world_sigma, or Parquet files with columns of these names
-and one problem per row. Results are Parquet files.
+With --batch, the command solves files of many problems in bounded memory and writes the poses to Parquet files. To
+continue after a stop, run the same command again. A file of problems, called a shard, is an NPZ or a Parquet file. An
+NPZ shard has the arrays world_points (B, N, 3), img_points (B, N, 2) and optionally weights, intrinsics, img_sigma and
+world_sigma. A Parquet shard has columns with these names, and one problem per row.
 
   pnpnet solve --batch shards/ --out poses/
 
@@ -42,7 +42,7 @@ _ADVICE = {
     "offset before they become float32",
     "behind": "the points are behind the camera; check the axes: x to the right, y down, z forward",
 }
-# Largest plausible noise, and smallest plausible share of inliers. A file with a wrong convention violates one of them.
+# Largest plausible noise, and smallest plausible share of inliers. A file with a wrong convention violates a limit.
 _MOST_NOISE_PX, _LEAST_SHARE = 10.0, 0.5
 _MISTAKES = (
     "swapped columns, another image size, y up? try --diagnose; many outliers? try --solver p3p-ransac:threshold=PX"
@@ -176,8 +176,6 @@ def _finite(values: Tensor) -> list[float | None]:
 
 
 def _table(answer: dict[str, Any], rvec_deg: list[float]) -> str:
-    """The answer in a few lines for a terminal."""
-
     def row(values: list[float], sigmas: list[float | None], unit: str = "") -> str:
         spread = [sigma for sigma in sigmas if sigma is not None]
         least = min(filter(None, spread), default=1e-3)  # two digits of the smallest standard deviation are shown

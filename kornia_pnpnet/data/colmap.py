@@ -17,7 +17,7 @@ from kornia_pnpnet.data.scenes import Scene, View
 
 __all__ = ["load_scene", "undistort"]
 
-# Possible folders of a model, relative to the user's folder: the folder itself, ETH3D's layout, COLMAP's layouts.
+# Possible folders of a model, relative to the user's folder. ETH3D and COLMAP use different sub-folders.
 _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 
 
@@ -26,13 +26,13 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
 
     The model is in the folder ``path`` or in one of its sub-folders ``dslr_calibration_undistorted`` (ETH3D),
     ``sparse/0`` and ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image
-    observes a point twice, the first pixel is used. Points behind the camera and points with NaN pixels are dropped.
+    observes a point twice, the first pixel is used. Points behind the camera and points without finite pixels are dropped.
     All pairs of a model count as inliers.
 
-    A file of matches is an ``.npz`` file with the matches of V images. It has the arrays ``names`` (V,),
-    ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with width and height. The names of all other
+    A file of matches is an ``.npz`` file with the matches of V images. The file has the arrays ``names`` (V,),
+    ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with widths and heights. The names of all other
     arrays start with the three-digit index of an image. For example, the M matches of image 7 are ``007_img_points``
-    (M, 2), ``007_world_points`` (M, 3) and ``007_error_px`` (M,), which are reprojection errors under the true pose.
+    (M, 2) and ``007_world_points`` (M, 3), and ``007_error_px`` (M,) has the reprojection errors at the true pose.
 
     Args:
         path: the folder or the file.
@@ -121,7 +121,6 @@ def _find_model(folder: Path) -> Path:
 
 
 def _colmap_views(folder: Path) -> Iterator[View]:
-    """Yield the images of a model with their observations."""
     place = _find_model(folder)
     pycolmap = _pycolmap()
     try:
@@ -140,7 +139,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
         intrinsics, pixels = _pinhole(image.camera, distorted)
         world_to_cam = image.cam_from_world().matrix()  # (3, 4)
         depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
-        # If a pose is not finite, depths are NaN. `~(depth <= 0)` keeps these points, so that `View` refuses the pose.
+        # A pose that is not finite gives NaN depths. Points of NaN depth are kept, so that `View` refuses the pose.
         seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
         arrays = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
         world, img, camera, rotation, translation = (torch.tensor(x, device="cpu") for x in arrays)
@@ -149,7 +148,6 @@ def _colmap_views(folder: Path) -> Iterator[View]:
 
 
 def _match_views(path: Path, max_error_px: float) -> Iterator[View]:
-    """Yield the images of a file of matches."""
     arrays = read_npz(path)
     if "names" not in arrays:
         raise ValueError("there is no array 'names'")

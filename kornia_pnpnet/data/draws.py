@@ -39,7 +39,7 @@ class RandomProblems:
 
     def batch(self, index: int) -> Problems:
         """Draw a batch; the first index is 0."""
-        with torch.device("cpu"):  # not PyTorch's default device: the generator is on the CPU
+        with torch.device("cpu"):  # the generator is on the CPU, even if PyTorch's default device is a GPU
             problems = self._draw(batch_generator(self.seed, index))
         return problems.map(lambda x: x.to(self.device, self.dtype if x.is_floating_point() else x.dtype))
 
@@ -84,9 +84,9 @@ def random_poses(
 ) -> Pose:
     """Draw world-to-camera poses. The defaults give the distribution of the paper's protocol.
 
-    The axis of the rotation has a uniform direction, and the angle is uniform from 0 to ``max_angle`` radians. The
-    translation is uniform in a cube of side ``translation_box`` about 0, or normal with the standard deviation
-    ``translation_sigma`` on each axis.
+    The axis of the rotation has a uniform direction, and the angle is uniform from 0 to ``max_angle`` radians. If
+    ``translation_sigma`` is ``None``, the translation is uniform in a cube of side ``translation_box`` about 0.
+    Otherwise, each coordinate of the translation is normal with the standard deviation ``translation_sigma``.
     """
     axis = normalize(normal((batch_size, 3), generator), dim=-1)
     angle = uniform((batch_size, 1), 0.0, max_angle, generator)

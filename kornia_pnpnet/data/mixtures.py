@@ -21,7 +21,7 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["MixedPoints", "MixedProblems", "VaryingSize"]
 
-# `VaryingSize` draws its numbers of pairs with the seed `seed + _SIZES`. Its sources use `seed`, `seed + 1` and so on.
+# `VaryingSize` draws numbers of pairs with the seed `seed + _SIZES`. The sources use the seeds `seed`, `seed + 1`, ...
 _SIZES = 1_000_003
 
 
@@ -63,13 +63,13 @@ class MixedProblems:
         sizes = _split(batch_size, shares, round)
         parts = zip(sources, sizes, strict=True)
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
-        # The order interleaves the sources, so that every slice of a batch has approximately the same shares.
+        # Sources are interleaved. Every slice of a batch then has approximately the shares of the whole batch.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__), device="cpu")
 
     def batch(self, index: int) -> Problems:
         """Draw a batch; the first index is 0."""
-        count = len(self.sources)  # each part has its own index, so that no two sources draw the same random numbers
+        count = len(self.sources)  # sources get different indices, so that they draw different random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
         KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must give covariances, or none of them.")
@@ -95,7 +95,7 @@ def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], 
 
 
 def _alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Give the field ``name`` equally many dimensions in all parts. Parts that lack it get NaN, unless all lack it."""
+    """Give the field ``name`` equally many dimensions in all parts. If only some parts lack the field, they get NaN."""
     values = [getattr(part, name) for part in parts]
     dimensions = {0 if value is None else value.ndim for value in values}
     if len(dimensions) == 1:

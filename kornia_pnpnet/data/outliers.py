@@ -16,10 +16,10 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# Distance of a near outlier's pixel from its point's pixel, in standard deviations of the noise. `_NEAR` is the default
-# range. `_LEAST_NEAR` limits the two ends of `near_pixels` from below. A choice: noise hardly exceeds 5 deviations.
+# `near_pixels` in standard deviations of the noise: the default range, and the smallest values of the two ends. The
+# numbers are choices. Noise hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
-# This number is added to n * max_ratio before rounding down. A ratio of 0.33 then gives floor(n / 3) for n up to 15.
+# `_SLACK` is added to numbers of outliers before rounding down. A ratio of 0.33 then gives floor(n / 3) for n up to 15.
 _SLACK = 0.05
 
 
@@ -39,32 +39,31 @@ class OutlierKind(IntEnum):
 class OutlierMix:
     r"""Number and kinds of the outliers of random problems.
 
-    The number of outliers is a uniform integer between two bounds, and the outliers are random pairs. The kinds are
-    assigned one after the other: structured, near, crowd, and last mismatch or sensing. Each step skips outliers that
+    The number of outliers is a uniform integer between two bounds, and the outliers are random pairs. Kinds are
+    assigned in four steps: structured, near, crowd, and finally mismatch or sensing. Each step skips outliers that
     already have a kind.
 
     Args:
-        max_ratio: largest share of outliers. The largest count is rounded down: 0.33 gives n // 3 for n up to 15.
+        max_ratio: largest share of outliers. The limit is rounded down: 0.33 allows n // 3 outliers for n up to 15.
         count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
-        min_count: smallest number of outliers. It is lowered to the largest number if that one is smaller.
+        min_count: smallest number of outliers, unless the largest number of outliers is smaller.
         min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
-        mismatch_share: probability that an outlier of no other kind is a *mismatch*, and not a *sensing* outlier. The
-            pixel of a mismatch shows another point. The pixel of a sensing outlier is uniform in the image.
-        near_share: probability that an outlier is *near*. The pixel of a near outlier is close to the pixel of its
-            point.
-        near_pixels: range, in pixels, from which the distance of a near outlier's pixel from its point's pixel is drawn
-            log-uniformly. The lower end is raised to at least 5 standard deviations of the pixel noise, the upper end
-            to at least 10. ``None`` means 5 to 50 standard deviations.
+        mismatch_share: probability that an outlier with none of the kinds below is a *mismatch*, with the pixel of
+            another point. Otherwise, the outlier is *sensing*, with a uniform pixel of the image.
+        near_share: probability that an outlier is *near*. The pixel of a near outlier is close to its point's pixel.
+        near_pixels: range of the distance, in pixels, between the pixel of a near outlier and the pixel of its point.
+            Distances are log-uniform. A lower end below 5 standard deviations of the pixel noise is raised to 5, and an
+            upper end below 10 is raised to 10. ``None`` means 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
-        structured_ratio: range from which each problem draws its ratio of structured outliers to inliers uniformly.
+        structured_ratio: range of the ratio of structured outliers to inliers. Each problem draws a uniform ratio.
         structured_angle: largest rotation angle in radians. The pixels of structured outliers show a copy of the
-            problem's points that is rotated by up to this angle and shifted.
-        mirrored_share: probability that this copy of a problem's points is also mirrored.
+            problem's points that is shifted and rotated by up to this angle.
+        mirrored_share: probability that the copy of a problem's points for structured outliers is also mirrored.
         crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
             leader. For each problem, the probability that an outlier joins a crowd is drawn uniformly from 0 to 1.
-        max_crowds: largest number of crowds. Each problem draws its number uniformly from 1 to ``max_crowds``.
-        point_crowd_share: probability that the crowds of a problem share the leaders' world points instead of pixels.
+        max_crowds: largest number of crowds. Each problem draws a number of crowds uniformly from 1 to ``max_crowds``.
+        point_crowd_share: probability that the crowds of a problem share a leader's world point instead of a pixel.
 
     Example:
         >>> OutlierMix().max_count(9), OutlierMix(max_ratio=0.33).max_count(9), OutlierMix(count=2).max_count(9)
@@ -163,7 +162,7 @@ def structured_points(cam_points: Tensor, mix: OutlierMix, generator: torch.Gene
 
 
 def crowd_leaders(batch_size: int, n: int, max_crowds: int, generator: torch.Generator) -> Tensor:
-    """Draw, for each pair, the index of its leader, (B, N). Only pairs of a crowd use their leader."""
+    """Draw the index of a leader for each pair, (B, N). Only pairs of a crowd use their leader."""
     leader = (n * unit((batch_size, max_crowds), generator)).long()  # (B, max_crowds)
     crowds = 1 + (max_crowds * unit((batch_size, 1), generator)).long()  # (B, 1)
     crowd = (crowds * unit((batch_size, n), generator)).long()

@@ -1,4 +1,4 @@
-"""Priors of points in the camera's frame, and the errors of points that depth cameras have measured.
+"""Priors of points in the camera's frame, and errors of points measured by depth cameras.
 
 A new prior is a class with the method ``__call__`` of :class:`PointPrior`. An argument of two numbers is a range.
 """
@@ -50,7 +50,7 @@ _LEAST_FACING = 0.05
 _ROOM_SIDE = (2.0, 15.0)
 _ROOM_HEIGHT = (2.2, 5.0)
 _FURNITURE = 4  # number of pieces of furniture
-_NEAREST = 0.15  # smallest depth of furniture, divided by the depth of the surface behind. Closer hits are ignored
+_NEAREST = 0.15  # rays ignore furniture that is closer than this share of the depth of the surface behind
 _CAMERA_HEIGHT = (1.0, 3.0)  # height of the camera above the street
 _STREET_SIDE = (2.5, 20.0)  # distance of the house fronts
 _STREET_END = (30.0, 200.0)  # distance of the end of the street
@@ -59,10 +59,10 @@ _NEARER = 0.3  # share of points on cars and trees
 _NOWHERE = 1e6  # height of a street's box, so large that no ray reaches the top
 # Largest field of view in degrees. A pinhole camera needs a field of view below 180 degrees.
 _WIDEST = 170.0
-# Depth maps: standard deviation of each coordinate of a map camera relative to the query camera, divided by the mean
-# distance of the points. Map and query camera then see a point from directions that differ by 10 to 40 degrees.
+# Depth maps: standard deviation of each coordinate of a map camera in the query camera's frame, divided by the mean
+# distance of the points. The directions from a point to the map camera and to the query camera differ by 10 to 40°.
 _BASELINE = 0.3
-# Depth maps: bounds, as shares of the distance, of the change of a flying pixel's distance from its map camera.
+# Depth maps: smallest and largest error of a flying pixel's distance from its map camera, divided by this distance.
 _FLIGHT = (-0.3, 0.6)
 
 
@@ -97,10 +97,10 @@ class BoxPoints:
 class SlabPoints:
     r"""Points of a tilted slab of random thickness, seen through a window of the image.
 
-    Thin slabs model façades and thick slabs model courtyards. Each problem draws a window with a centre :math:`c`, a
-    distance :math:`d`, slopes :math:`g` and a thickness :math:`e`. Each point has a uniform direction
-    :math:`p = (x/z, y/z)` in the window and the depth :math:`z = d\,(1 + g \cdot (p - c))(1 + e\,u)` with :math:`u`
-    uniform in [0, 1).
+    Thin slabs model façades and thick slabs model courtyards. Each problem draws a distance :math:`d`, slopes
+    :math:`g`, a thickness :math:`e`, and a window with the centre :math:`c`. Each point has a uniform direction
+    :math:`p = (x/z, y/z)` in the window. The depth of the point is :math:`z = d\,(1 + g \cdot (p - c))(1 + e\,u)` with
+    :math:`u` uniform in [0, 1).
     """
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
@@ -119,8 +119,8 @@ class SlabPoints:
 class ObjectPoints:
     """Points of an object with random proportions, rotation, direction and distance.
 
-    The object is a box of half-size 1 or a Gaussian cloud with a standard deviation of 0.5. Random factors make the
-    object thinner along two axes; some objects are planar.
+    The object is a cube of side 2 or a Gaussian cloud with a standard deviation of 0.5. Random factors make the object
+    thinner along two axes. Some objects are planar.
     """
 
     def __call__(self, batch_size: int, n: int, generator: torch.Generator) -> Tensor:
@@ -165,13 +165,13 @@ class _View:
 class FacadePoints(_View):
     """Points of one façade with relief, or of two such façades that meet at a corner.
 
-    Each façade is a plane that is turned away from the camera by a random angle. About half of the points, chosen at
-    random, lie deeper by the relief, as in recesses. All depths also get normal noise, with a standard deviation of a
-    tenth of the relief.
+    Each façade is a plane that is turned away from the camera by a random angle. The relief is a random depth. About
+    half of the points lie deeper by the relief, like points in recesses. All depths also get normal noise with a
+    standard deviation of a tenth of the relief.
 
     Args:
         field_of_view: range, in degrees, from which the field of view of the square image is drawn uniformly.
-        window: range from which the window's share of the image area is drawn log-uniformly. All points lie in it.
+        window: range of the window's share of the image area, drawn log-uniformly. All points lie in the window.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -193,7 +193,7 @@ class RoomPoints(_View):
     """Points of a room seen from inside: floor, ceiling, walls and pieces of furniture.
 
     The room is a box. The camera has a random rotation and a random position that is not close to a wall. Each piece of
-    furniture is a box that hides the wall behind. For the arguments see :class:`FacadePoints`.
+    furniture is a box that hides the wall behind it. For the arguments see :class:`FacadePoints`.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -201,7 +201,7 @@ class RoomPoints(_View):
         turn = random_poses(batch_size, generator, max_angle=math.pi).rotation
         ground = log_uniform((batch_size, 1, 2), *_ROOM_SIDE, generator)
         size = torch.cat((ground, uniform((batch_size, 1, 1), *_ROOM_HEIGHT, generator)), -1)  # (B, 1, 3)
-        low = -size * uniform((batch_size, 1, 3), 0.15, 0.85, generator)  # relative to the camera, in the room's axes
+        low = -size * uniform((batch_size, 1, 3), 0.15, 0.85, generator)  # a corner of the room, relative to the camera
         in_room = rays @ turn.mT
         z = _hits(in_room, low, low + size)[1]
         # Furniture stands on the floor. A piece that contains the camera has a negative `near` and is left out below.
@@ -236,28 +236,28 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Multiples of ``rays``, (..., 3), at which rays enter and leave a box. If enter >= leave, a ray misses the box."""
+    """Multiples of ``rays``, (..., 3), where rays enter and leave a box. A ray with enter >= leave misses the box."""
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)
 
 
 @dataclass(kw_only=True, eq=False)
 class DepthMaps:
-    r"""Errors of world points that depth cameras have measured from several map images.
+    r"""Errors of world points that come from the depth maps of several cameras.
 
     Each world point comes from the depth map of one of ``maps`` cameras near the query camera. Three errors occur:
 
-    - noise along the ray of the map camera. Its standard deviation is :math:`a d^2 / \bar d` at the distance :math:`d`
-      from the map camera, because the noise of stereo and structured light grows with the square of the distance. Here,
-      :math:`\bar d` is the mean distance of the points from the query camera.
+    - noise along the ray of the map camera. At the distance :math:`d` from the map camera, the standard deviation is
+      :math:`a d^2 / \bar d`, where :math:`\bar d` is the mean distance of the points from the query camera. The noise
+      of stereo cameras and of structured light also grows with the square of the distance.
     - the error of the map camera's rotation. This error turns all points of one map about the map camera.
-    - *flying pixels*: at the edge of an object, the measured distance lies between object and background. Pairs with a
-      flying pixel are outliers.
+    - *flying pixels*: at the edge of an object, the measured distance lies between the object and the background. Pairs
+      with a flying pixel are outliers.
 
     Args:
-        depth_noise: range of :math:`a`, the ratio of the standard deviation at the distance :math:`\bar d` to this
-            distance. Each problem draws a log-uniform number.
-        angle: range of the standard deviation of a map camera's rotation error about each axis, in degrees. Each
+        depth_noise: range of :math:`a`, the relative standard deviation at the distance :math:`\bar d`. Each problem
+            draws a log-uniform number.
+        angle: range, in degrees, of the standard deviation of a map camera's rotation error about each axis. Each
             problem draws a log-uniform number.
         flying_share: probability that a point is a flying pixel.
         maps: number of map cameras of a problem.
@@ -286,7 +286,7 @@ class DepthMaps:
         of_map = (self.maps * unit(each, generator)).long()
         ray = cam_points - centre.take_along_dim(of_map, 1)
         sigma = log_uniform(one, *self.depth_noise, generator)
-        change = sigma * ray.norm(dim=-1, keepdim=True) / size * normal(each, generator)  # relative to the distance
+        change = sigma * ray.norm(dim=-1, keepdim=True) / size * normal(each, generator)  # in units of `ray`
         is_flying = unit(each, generator) < self.flying_share
         change = torch.where(is_flying, uniform(each, *_FLIGHT, generator), change)
         return change * ray + torch.linalg.cross(turn.take_along_dim(of_map, 1), ray), is_flying

@@ -87,7 +87,7 @@ class Scene:
 
     @property
     def median_depth(self) -> float:
-        """Median depth of the observed points of all images in the unit of the scene."""
+        """Median depth, in the unit of the scene, of the observed points of all images."""
         return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
 
 
@@ -96,9 +96,9 @@ class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
     Each problem consists of ``n`` random points of a random image and their pixels. ``outliers`` changes the pixels of
-    some pairs. A *mismatch* gets the pixel of a spare point, a point of the same image that is in no pair. A *sensing*
-    outlier gets a uniform pixel. ``outliers=OutlierMix(count=2)`` gives the protocol's real data with outliers. Points
-    and poses do not depend on ``outliers``.
+    some pairs. A *mismatch* gets the pixel of a spare point: a further point of the same image that is in no pair. A
+    *sensing* outlier gets a uniform pixel. For real data with outliers, the protocol uses
+    ``outliers=OutlierMix(count=2)``. Points and poses do not depend on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
     this pose is the true pose: :math:`x' = R^{*\top}(R x + t - t^*)`, where :math:`(R, t)` is the image's pose.
@@ -166,7 +166,7 @@ class SceneProblems(RandomProblems):
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
-    """For each of ``counts``, (B,), draw k different integers from 0 to count - 1 by Floyd's algorithm, (B, k)."""
+    """Draw k different integers from 0 to count - 1 for each of the B ``counts`` by Floyd's algorithm, (B, k)."""
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
@@ -174,5 +174,5 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
         candidate = (draws[:, i] * (last + 1)).long()
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)
-    # Floyd's algorithm draws a uniformly random set, but in an order that is not uniform. Each row is then shuffled.
+    # The algorithm draws a uniformly random set, but the order of the integers is not uniform. Each row is shuffled.
     return chosen.gather(1, unit((len(counts), k), generator).argsort(1))

@@ -42,8 +42,8 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
             picklable and the main module must be safe to import.
         start: index of the first batch.
         stop: index after the last batch.
-        workers: number of worker processes. With 0, each batch is drawn on request. The problems do not depend on the
-            number of workers.
+        workers: number of worker processes. With 0, the caller's process draws the batches. The problems do not depend
+            on the number of workers.
     """
     if workers == 0:
         yield from map(source.batch, range(start, stop))
@@ -57,19 +57,19 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         num_workers=workers,
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
-        generator=torch.Generator(),  # otherwise the loader would draw from PyTorch's global generator
-        # In processes of joblib, the default start method is joblib's own. A loader cannot use this method.
+        generator=torch.Generator(),  # the loader must not draw from PyTorch's global generator
+        # In processes of joblib, the default start method is joblib's own method, which a loader cannot use.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
     arrays: Any = iter(loader)
     # At exit, multiprocessing sends one SIGTERM to each worker and waits. Workers ignore the first SIGTERM, so this
-    # finalizer ends the workers first.
+    # finalizer ends the workers earlier.
     end_workers = Finalize(None, arrays._shutdown_workers, exitpriority=0)
     try:
         for batch in arrays:
             yield tree_map_only(np.ndarray, torch.from_numpy, batch)
     finally:
-        end_workers()  # otherwise a traceback that refers to `arrays` keeps the workers alive
+        end_workers()  # a traceback that refers to `arrays` would keep the workers alive
 
 
 def _draw_arrays(source: ProblemSource, index: int) -> Any:
@@ -78,6 +78,5 @@ def _draw_arrays(source: ProblemSource, index: int) -> Any:
 
 
 def _ignore_signals(_worker: int) -> None:
-    """Ignore Ctrl-C and the first SIGTERM. A second SIGTERM ends the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _frame: signal.signal(number, signal.SIG_DFL))

@@ -21,7 +21,7 @@ from kornia_pnpnet.result import Pose, Problems
 
 __all__ = ["CameraProblems", "SyntheticProblems"]
 
-#: A number, or a range: two numbers between which each problem draws a log-uniform number.
+#: A number, or a range of two numbers. From a range, each problem draws a log-uniform number.
 Amount: TypeAlias = float | Sequence[float]
 
 # Smallest and largest value of each amount. Every amount may also be 0. The bounds of `degrees` and `sigma_spread` keep
@@ -30,23 +30,23 @@ _ANY = (0.0, math.inf)
 _AMOUNTS = {"img_sigma": _ANY, "world_sigma": _ANY, "degrees": (1.0, math.inf), "sigma_spread": (0.0, 3.0)}
 # Largest axis ratio. Up to this ratio, float32 resolves the shortest axis of a covariance.
 _MOST_RATIO = 100.0
-# Largest pixel noise of an inlier with Student noise, in units of `img_sigma`. A choice.
+# Chosen limit of an inlier's pixel noise, in units of `img_sigma`. The limit holds for Student noise only.
 _MOST_NOISE = 10.0
-# Smallest divisor in pixels. It replaces a standard deviation of 0.
+# Standard deviation, in pixels, that replaces 0 in a division.
 _TINY = 1e-9
-# Smallest cosine of the angle between the optical axis and a visible point's direction. A choice: 87°.
+# A camera sees points up to about 87° from the optical axis. `_LEAST_COSINE`, the cosine of this angle, is a choice.
 _LEAST_COSINE = 0.05
-# At a focal length of 1, half the side of the largest image if `half_image` is `None`. Some points may lie outside.
+# If `half_image` is `None`: half the side of the largest image at focal length 1. Points may lie outside the image.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
-# Number of leading pairs of a problem that are never copies. A choice: eight pairs can still determine a pose.
+# The first `_LEAST_ORIGINALS` pairs of a problem are never copies. A choice: eight pairs can still determine a pose.
 _LEAST_ORIGINALS = 8
-# Largest blur in `_bunched`, relative to the mean distance. A choice: at a blur of 2, a bunch is hardly visible.
+# `_bunched` adds random blur to relative distances. Chosen limit of the blur: at 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
 # Choices for confidences.
 _SEPARATION = (0.0, 4.0)  # mean score of inliers without noise minus mean score of outliers
 _NOISINESS = (0.0, 1.0)  # decrease of an inlier's score when log(1 + noise) grows by 1
-_GAIN = (0.3, 3.0)  # factor from scores to logits
-_OFFSET = 1.5  # standard deviation of the offset of the logits
+_GAIN = (0.3, 3.0)  # factor by which scores are multiplied to get logits
+_OFFSET = 1.5  # standard deviation of the random number that is added to all logits of a problem
 # `CameraProblems`: smallest and largest mean depth of a problem. The unit of the world is arbitrary.
 _NEAREST, _FARTHEST = 2.0, 50.0
 # `CameraProblems`: half the side of the square image, in pixels.
@@ -71,9 +71,9 @@ class SyntheticProblems(RandomProblems):
             ``None``, translations are uniform in a cube of side 25 about 0.
         max_angle: largest rotation angle in radians.
         focal: focal length in pixels. The principal point is the pixel (0, 0).
-        half_image: half the side, in pixels, of the image, which is a square about 0. The pixels of *sensing* outliers
-            are uniform in the image. ``None`` means the smallest square that contains the pixels of all points of a
-            problem, with a field of view of at most 120°.
+        half_image: half the side, in pixels, of the square image with the centre (0, 0). The pixels of *sensing*
+            outliers are uniform in the image. ``None`` means the smallest image that contains the pixels of all points
+            of a problem, limited to a field of view of 120°.
         img_sigma: standard deviation, in pixels, of the noise on each pixel coordinate, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
         degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range. 0 means Gaussian noise. With
@@ -81,21 +81,20 @@ class SyntheticProblems(RandomProblems):
             ``10 * img_sigma`` are outliers.
         sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. With a spread
             above 0, the sigmas of a batch have the shape ``(batch_size, n)``.
-        axis_ratio: the noise of a pair has random axes. This is the largest standard deviation along an axis divided by
-            the smallest, at most 100. Above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the axes,
-            known noise is given as covariances, and ``known_noise`` must be 0 or 1.
-        known_noise: share of the problems that come with both sigmas. With 0, batches have no sigmas. Above 0, a third
-            of the other problems come with one of the two sigmas, and each missing sigma is NaN.
+        axis_ratio: largest standard deviation of a pair's noise along an axis divided by the smallest, at most 100. The
+            axes are random. With a ratio above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the
+            axes, known noise is given as covariances, and ``known_noise`` must be 0 or 1.
+        known_noise: share of the problems that come with both sigmas. With 0, batches have no sigmas. With a share
+            above 0, a third of the other problems come with one of the two sigmas, and missing sigmas are NaN.
         confidence_share: share of the problems that have confidences. The confidences of other problems are NaN. With
-            0, batches have no confidences. The separation of inliers from outliers and the scale of the confidences'
-            logits differ between problems.
+            a share of 0, batches have no confidences. Problems differ in how well confidences separate inliers from
+            outliers, and in the scale of the logits of confidences.
         bunched_share: share of the problems in which all inliers, *near* outliers and *structured* outliers are bunched
             in one part of the image. The points of all other outliers come from the rest of the scene.
-        depth_maps: errors of world points that depth cameras have measured, in addition to ``world_sigma``. Known noise
-            does not include these errors. ``None`` means no errors of depth cameras.
-        copies_share: share of the problems with copies of pairs, as from detectors that list a place several times. In
-            such problems, a pair is a copy of another pair with a probability of up to 0.5. The first 8 pairs are never
-            copies.
+        depth_maps: errors of depth cameras in the world points, in addition to the noise of ``world_sigma``. Known
+            noise does not include errors of depth cameras. ``None`` means no errors of depth cameras.
+        copies_share: share of the problems with copies of pairs, as from detectors that list a place several times. The
+            probability that a pair of such a problem is a copy is at most 0.5. The first 8 pairs are never copies.
         dtype: dtype of the batches. Numbers are drawn in float64.
         device: device of the batches. Numbers are drawn on the CPU.
 
@@ -146,7 +145,7 @@ class SyntheticProblems(RandomProblems):
         pose = random_poses(size, generator, translation_sigma=self.translation_sigma, max_angle=self.max_angle)
         # The scene has 2N points: N points of the pairs, and N points for the pixels of mismatches and crowds.
         scene = (self.points or BoxPoints())(size, 2 * n, generator)
-        kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), as all masks below
+        kind = mix.draw(size, n, generator)[..., None]  # (B, N, 1), like all masks below
         has_other = (kind == OutlierKind.MISMATCH) | (kind == OutlierKind.CROWD) | (kind == OutlierKind.POINT_CROWD)
         is_sensing = kind == OutlierKind.SENSING
         anywhere = self._anywhere(scene, generator)
@@ -204,7 +203,7 @@ class SyntheticProblems(RandomProblems):
         is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
         other = (n * unit((size, n), generator)).long()
         index = torch.where(is_copy, other, torch.arange(n))
-        # With n = 3, poses and cameras also have this shape. They do not change: the first 8 pairs are never copies.
+        # If n = 3, poses and cameras are indexed too. They do not change, because the first 8 pairs are never copies.
         return problems.map(lambda x: x[torch.arange(size)[:, None], index] if x.shape[1:2] == (n,) else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
@@ -221,15 +220,15 @@ class SyntheticProblems(RandomProblems):
         """Reorder points, (B, 2N, 3). All pairs get points of a bunch, except the outliers in ``displaced``, (B, N)."""
         shape, each = scene.shape[:2], (len(scene), 1)
         direction = normalize(scene, dim=-1)
-        # The score of a point is the distance of its direction from the direction of the first point, plus blur.
+        # The score of a point is the relative distance of its direction from the first point's direction, plus blur.
         distance = (direction - direction[:, :1]).square().sum(-1).sqrt()
         blur = uniform(each, 0.0, _MOST_BLUR, generator) * unit(shape, generator)
         score = distance / distance.mean(1, keepdim=True).clamp(min=torch.finfo(distance.dtype).tiny) + blur
         chosen = unit(each, generator) < self.bunched_share
         score = torch.where(chosen, score, unit(shape, generator))
         last = pad(displaced, (0, self.n), value=True)
-        # Pairs that are not displaced get the points with the lowest scores. The order is random, so that a pair's
-        # index is independent of its pixel.
+        # Pairs that are not displaced get the points with the lowest scores. The order of these points is random, so
+        # that a pair's index is independent of its pixel.
         rank = (last + unit(shape, generator)).argsort(1).argsort(1)
         return scene.take_along_dim(score.argsort(1).gather(1, rank)[..., None], 1)
 
@@ -238,9 +237,9 @@ class SyntheticProblems(RandomProblems):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         r"""Draw noise, (B, N, D), with its standard deviations, (B, 1) or (B, N), and its covariances, (B, N, D, D).
 
-        The covariances are ``None`` when ``axis_ratio`` is 1. For Student noise with :math:`\nu` degrees of freedom, a
-        length :math:`r` of standard normal noise becomes :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`. In two dimensions, the
-        result has the bivariate Student distribution.
+        The covariances are ``None`` when ``axis_ratio`` is 1. For Student noise with :math:`\nu` degrees of freedom,
+        standard normal noise of length :math:`r` is scaled to the length :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`. In two
+        dimensions, the result has the bivariate Student distribution.
         """
         noise = normal(shape, generator)
         sigmas = self._amounts(sigma, generator)
@@ -304,12 +303,12 @@ class CameraProblems(RandomProblems):
         n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`SyntheticProblems`.
         field_of_view: range, in degrees, from which each camera draws its horizontal field of view uniformly.
-        depth_spread: range from which each problem draws its spread uniformly. Depths divided by the mean depth are
-            uniform from ``1 - spread`` to ``1 + spread``.
+        depth_spread: range from which each problem draws its depth spread uniformly. Depths divided by the mean depth
+            are uniform from ``1 - spread`` to ``1 + spread``.
         outlier_share: share of the pairs that are outliers. The number of outliers is rounded to an integer.
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
         cameras: number of cameras. Two or more cameras form a rig, and batches then have ``cam_from_rig``.
-        baseline: distance of the camera centres from the origin of the rig, relative to the mean depth.
+        baseline: distance of the camera centres from the origin of the rig, divided by the mean depth.
 
     Example:
         >>> problems = CameraProblems(n=12, batch_size=2, seed=1, outlier_share=0.25, cameras=3).batch(0)

@@ -45,14 +45,14 @@ class KnownInliersAndNoise(Configured):
 
     The variance is :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2`, where
     :math:`J_x` is the Jacobian of the pixel with respect to the world point at the true pose. If the problems have
-    covariances, these replace the sigmas and whiten the residuals. The result is then the maximum likelihood estimate.
+    covariances, they replace the sigmas and whiten the residuals. The result is then the maximum likelihood estimate.
 
     Args:
         img_sigma: standard deviation of a pixel coordinate. The default is the value of the protocol's synthetic data.
         world_sigma: standard deviation of a world coordinate. The default is also the protocol's value.
 
     Raises:
-        BaseError: for a standard deviation that is negative or not finite, or when both are 0.
+        BaseError: for a standard deviation that is negative or not finite, or when both standard deviations are 0.
     """
 
     def __init__(self, *, img_sigma: float = 1.0, world_sigma: float = 0.05) -> None:
@@ -68,14 +68,14 @@ class KnownInliersAndNoise(Configured):
         noise |= {name: sigma for name, sigma in self.config.items() if noise[name.replace("sigma", "cov")] is None}
         return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **noise)
 
-    @torch.no_grad()  # else a NaN point would give its camera a NaN gradient
+    @torch.no_grad()  # with gradients, a NaN point would give its camera a NaN gradient
     def _inverse_variances(self, problems: Problems) -> Tensor:
-        """The weight of each pair in 1/px², (B, N); 0 for outliers."""
+        """The weight of each pair in 1/px², (B, N). Outliers have the weight 0."""
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # the solver ignores points behind the camera
         focal = problems.pair_intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
-        # J_x = (f / z) [1, 0, -p; 0, 1, -q] R; the rotation cancels in the trace.
+        # J_x = (f / z) [1, 0, -p; 0, 1, -q] R with p = x / z and q = y / z. The rotation cancels in the trace.
         trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
         variance = self.config["img_sigma"] ** 2 + self.config["world_sigma"] ** 2 * trace / 2.0
         return torch.where(problems.inliers, variance.reciprocal(), 0.0)

@@ -1,4 +1,4 @@
-"""Comparison of solvers: all solvers solve the same problems, and a results file holds their errors and times."""
+"""Comparison of solvers: all solvers solve the same problems, and a results file holds the errors and the times."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class EvaluationData(NamedTuple):
     max_rotation_deg: float = 1.0  #: Limit of the rotation error in degrees.
     max_translation: float = 0.2  #: Limit of the translation error in the unit of the world.
     unit: str = "m"  #: Name of the unit of the world.
-    description: Mapping[str, Any] = {}  #: Source of the problems as plain data for the results file.
+    description: Mapping[str, Any] = {}  #: Plain data about the source of the problems, for the results file.
 
 
 @runtime_checkable
@@ -97,7 +97,7 @@ def evaluate(
 
         The row of a set and a solver has ``success`` (rate, low, high, total), ``rotation_error_deg`` and
         ``translation_error`` (quartiles), ``ok`` (share), ``us_per_problem`` (median of the timed calls),
-        ``per_problem`` (errors and ok), and the entries of ``environment`` that differ from the file's, if any.
+        ``per_problem`` (errors and ok) and possibly ``environment`` (entries that differ from the file's entries).
 
     Raises:
         ValueError: when ``path`` is not a results file, or holds another evaluation.
@@ -127,12 +127,12 @@ def evaluate(
     results["left_out"] = []
     elsewhere = {key: here[key] for key in _MACHINE if results["environment"].get(key) != here[key]}
     if path is not None:
-        save_results(results, path)  # a failure to write appears here, before the work
+        save_results(results, path)  # a file that cannot be written fails here, before the work
 
     plan = list(product(data, solvers))
     done = {(row["data"], row["solver"]): row for row in results["rows"]}
     missing = [names for names in plan if names not in done]
-    for names in tqdm(missing, disable=None, unit="run"):  # None: no bar without a terminal
+    for names in tqdm(missing, disable=None, unit="run"):  # without a terminal, there is no progress bar
         row: dict[str, Any] = dict(zip(("data", "solver"), names, strict=True))
         try:
             row |= _measure(solvers[row["solver"]], data[row["data"]], chunk, repeats)

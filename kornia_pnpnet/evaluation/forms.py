@@ -47,7 +47,7 @@ class _Results(TypedDict):
 
 
 def _consistent(results: Any) -> Any:
-    """Raise ``ValueError`` if ``data`` or ``solvers`` lacks a name of a row, or if lists of a row differ in length."""
+    """Raise ``ValueError`` if a row has an unknown data set or solver, or lists of different lengths."""
     for i, row in enumerate(results["rows"]):
         if len({len(values) for values in row.get("per_problem", {}).values()}) > 1:
             raise ValueError(f"rows[{i}].per_problem has lists of different lengths")

@@ -29,15 +29,15 @@ _COMPETITORS = (
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Options of RANSAC for real scenes. The threshold is the best of a grid from 3 to 60 px on five scenes with 0, 2 and 4
-# outliers in 9 pairs, drawn with another seed than `DEFAULT_SEED`. Success hardly changes from 6 to 20 px.
+# Options of RANSAC for real scenes. On five scenes, with 0, 2 and 4 outliers in 9 pairs and a seed other than
+# `DEFAULT_SEED`, this threshold is the best of a grid from 3 to 60 px. Success hardly changes from 6 to 20 px.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
-# Options of RANSAC for synthetic data. The thresholds are the best of a grid from (3 px, 0.15 m) to (8 px, 0.4 m), on
-# problems of another seed than `DEFAULT_SEED`. Success varies by one percentage point over the grid.
+# Options of RANSAC for synthetic data. On problems with a seed other than `DEFAULT_SEED`, these thresholds are the best
+# of a grid from (3 px, 0.15 m) to (8 px, 0.4 m). Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Module and name of each optional package, keyed by the start of the names of its solvers.
+# Module and name of each optional package. The key is the start of the names of the package's solvers.
 _PACKAGES = {peer.source[1].lower(): peer.source for peer in (OpenCVPnP, KorniaRs, PoseLib, PyColmap)}
 
 
@@ -45,8 +45,8 @@ def load_solver(spec: str) -> nn.Module:
     """Build a solver or a bound, in evaluation mode, from its name.
 
     Args:
-        spec: a name of :func:`~kornia_pnpnet.registry.list_solvers` or of :data:`BOUNDS`, with options after a colon
-            (``"opencv-ransac:threshold=12,refine=false"``), or a folder of weights.
+        spec: a folder of weights, or a name of :func:`~kornia_pnpnet.registry.list_solvers` or of :data:`BOUNDS`. A
+            name can have options after a colon, for example ``"opencv-ransac:threshold=12,refine=false"``.
 
     Raises:
         BaseError: for an unknown name or option.
@@ -87,6 +87,6 @@ def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic
 
 
 def missing_package(solver: str) -> str | None:
-    """The name of the package that a solver needs and that is not installed, or ``None``."""
+    """The name of a missing package that a solver needs, or ``None`` if no package is missing."""
     needed = (package for prefix, package in _PACKAGES.items() if solver.startswith(prefix))
     return next((name for module, name in needed if importlib.util.find_spec(module.split(".")[0]) is None), None)

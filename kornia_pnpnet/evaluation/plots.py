@@ -1,6 +1,6 @@
-"""Pictures of a pose, an evaluation and a training, in the format of the file's suffix.
+"""Pictures of a pose, an evaluation and a training.
 
-The settings of matplotlib change only while a picture is drawn.
+The suffix of a file determines its format. The settings of matplotlib change only while a picture is drawn.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ THEME: Any = {
     **{"axes.axisbelow": True, "axes.edgecolor": "#444444", "axes.grid": True, "grid.color": "#cccccc"},
     **{"axes.titlelocation": "left", "errorbar.capsize": 1.6, "font.sans-serif": ["DejaVu Sans"]},
 }
-themed = rc_context(THEME)  #: Decorator of functions that draw.
+themed = rc_context(THEME)  #: Decorator of functions that draw pictures.
 
 
 def make_figure(width: float, height: float, *heading: str) -> Figure:
@@ -51,7 +51,7 @@ def make_figure(width: float, height: float, *heading: str) -> Figure:
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write the figure; missing folders are made."""
+    """Write the figure, and make missing folders."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=200)
     return Path(path)
@@ -63,8 +63,8 @@ def plot_pose(path: str | Path, img_points: Tensor, reprojections: Tensor, rejec
 
     Args:
         path: the file to write.
-        img_points: pixels, shape (N, 2). Pixels that are not finite are left out. If all are, ``ValueError`` is raised.
-        reprojections: reprojected points in pixels, shape (N, 2). For points behind the camera, they are not finite.
+        img_points: pixels, shape (N, 2). Only finite pixels are drawn. If no pixel is finite, ``ValueError`` is raised.
+        reprojections: reprojected points in pixels, shape (N, 2), not finite for points behind the camera.
         rejected: whether a pair is rejected, bool, shape (N,).
         title: first part of the title.
     """

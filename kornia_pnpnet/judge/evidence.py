@@ -48,6 +48,7 @@ __all__ = [
     "pose_sigma",
     "probability",
     "updated",
+    "within_limits",
 ]
 
 # Smallest standard deviation in the grid for unknown noise, in radians.
@@ -74,17 +75,15 @@ _POSES = 4
 # number is transcendental, so that different rows of integers have different keys.
 _KEY = math.pi / 4
 
-#: A pose is believed when its :func:`probability` is at least this value.
-LEAST_PROBABILITY = 0.95
+#: A pose is believed when its :func:`probability` is at least this value, about that of two standard deviations.
+LEAST_PROBABILITY = 0.955
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
 #: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.
-LAW = (-0.3902, 0.6246, -0.2504)
+LAW = (-0.2726, 0.6495, -0.2213)
 # Ranges to which the variables of `LAW`, the evidence and the logarithm of `pose_sigma`, are clipped.
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
-# Largest `pose_sigma` of a pose that is believed. The unit of `pose_sigma` is the largest error of a correct pose.
-_OPEN = 0.5
 # Largest standard deviation of plausible noise in radians. The value 0.0125 would reject 4 % of the correct poses of
 # indoor RGB-D matches (`rgbd/indoor.npz`, without a ratio test).
 _MOST_NOISE = 0.016
@@ -287,20 +286,20 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, odds: Tensor | None = None) -> Tensor:
     """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The probability is a logistic function of the evidence and of log :func:`pose_sigma`, multiplied by the
-    probability from the log-odds ``odds`` (B,) of the pose against other poses (``None``: there are none). It is 0 if
-    ``pose_sigma`` is large, if the points of the inliers lie on a line, or if the noise is implausible, because pairs
-    of a wrong convention, such as mirrored pixels, have large residuals. If ``known`` (B, 1), noise up to the caller's
-    noise is plausible, too.
+    The probability is the product of three probabilities: a logistic function of the evidence and of log
+    :func:`pose_sigma`, the probability :func:`within_limits` of a small error, and the probability from the log-odds
+    ``odds`` (B,) of the pose against other poses (``None``: there are none). The result is 0 if the points of the
+    inliers lie on a line, or if the noise is implausible, because pairs of a wrong convention, such as mirrored pixels,
+    have large residuals. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
     plausible = (found.sigma < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
     sigma = pose_sigma(seen.projection, problem, precision).detach()
-    usable = plausible & (sigma < _OPEN) & _leave_a_line(problem.world_points, found.inlier > 0.5)
+    usable = plausible & _leave_a_line(problem.world_points, found.inlier > 0.5)
     log_ratio, log_sigma = clipped(found.log_ratio, sigma)
     offset, by_evidence, by_sigma = LAW
-    chance = torch.sigmoid(offset + by_evidence * log_ratio + by_sigma * log_sigma)
+    chance = torch.sigmoid(offset + by_evidence * log_ratio + by_sigma * log_sigma) * within_limits(sigma)
     chance = chance if odds is None else chance * torch.sigmoid(odds)
     return torch.where(usable, chance, 0.0)
 
@@ -308,6 +307,11 @@ def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, 
 def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     """Clip the evidence and the logarithm of sigma to the ranges for which :data:`LAW` was fitted."""
     return log_ratio.clamp(*_EVIDENCE), sigma.log().clamp(*_LOG_SIGMA).to(log_ratio.dtype)
+
+
+def within_limits(sigma: Tensor) -> Tensor:
+    """Probability that a Gaussian error with the standard deviation ``sigma`` is at most 1, float32."""
+    return torch.erf(0.5**0.5 / sigma.float())
 
 
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:

@@ -23,24 +23,24 @@ __all__ = ["find_alternatives", "reconsider"]
 
 # Another pose is kept when the ratio of its likelihood to the likelihood of the refined pose exceeds this number.
 _LIKELY = 1e-3
-# The logarithm of the ratio is clipped at this number, so that the exponential does not overflow.
+# The logarithm of a likelihood ratio is clipped at this number, so that its exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum if this number exceeds both the angle, in radians, between the rotations and the shift
-# of the mean point in the camera frame, divided by the distance of the mean point from the camera.
+# Two poses are the same minimum if two numbers are below _SAME: the angle between the rotations in radians, and the
+# shift of the mean point in the camera frame, divided by the distance of the mean point from the camera.
 _SAME = 0.035
 # A mirror image is refined if most inliers have residuals below this number times the spread of the inliers' pixels.
 _NEAR_MIRROR = 0.2
-# Rivals are other poses that may explain the pairs. One rival starts with a noise of at least this number of radians.
+# A rival is another pose that may explain the pairs. The wide rival starts with a noise of at least this many radians.
 _WIDE_ANGLE = 6.4e-3
-# Index of the first entry of `Evidence.grid` with at least this noise.
+# Index of the first entry of `Evidence.grid` with at least the noise _WIDE_ANGLE.
 _WIDE_FROM = 4
-# This rival is tried only if the larger noise lowers the log-likelihood by less than this number per vote.
+# The wide rival is tried only if the larger noise lowers the log-likelihood by less than this number per vote.
 _GAP = 0.4
-# This rival is tried only if the share of inliers is below this number.
+# The wide rival is tried only if the share of inliers is below this number.
 _CLEAR = 0.9
-# Divisor of the variance with which a given rival (argument `rival` of `reconsider`) starts, if the noise is unknown.
+# An unknown variance is divided by this number at the start of a given rival (argument `rival` of `reconsider`).
 _SMALLER = 4.0
-# A given rival is tried only if its rotation differs from the pose by more than this angle, in radians.
+# A given rival is tried only if its rotation differs from the refined rotation by more than this angle, in radians.
 _APART = 0.02
 # A given rival is tried only if the share of inliers is below this number.
 _CLEAR_OF_RIVALS = 0.97
@@ -112,10 +112,10 @@ def reconsider(
 ) -> tuple[Progress, Evidence, Tensor]:
     """Compare refined poses with rivals. If ``refine.by_residual`` is positive, each problem keeps its likeliest pose.
 
-    If the noise is unknown and a larger noise is almost as likely, one rival starts from the refined pose with the
-    larger noise. One rival starts from the mirror image of the pose, if the mirror image has small residuals. A given
-    rival is used if its rotation differs from the rotation of the pose. If the noise is unknown, a given rival starts
-    with a smaller noise. A rival that ends more than 10 degrees from the result lowers the probability of the result.
+    If the noise is unknown and a larger noise is almost as likely, a rival starts from the refined pose with the
+    larger noise. If the mirror image of the pose has small residuals, another rival starts from the mirror image. A
+    given rival is used if its rotation differs from the rotation of the pose. If the noise is unknown, a given rival
+    starts with a smaller noise. A rival that ends more than 10 degrees from the result makes the result less probable.
 
     Args:
         refine: the refiner.
@@ -123,14 +123,13 @@ def reconsider(
         now: the refined poses.
         found: the evidence for the refined poses.
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
-        rival: given rivals, such as those of ``search_on``. ``None``: there are no given rivals.
-        replaced: whether the given rival replaces the refined pose of a problem, bool, shape :math:`(B,)`. Such a rival
-            starts with the noise of its own residuals. The given rivals of all other problems are ignored.
-            ``None``: the likelihood selects the pose of every problem.
+        rival: given rivals, for example of ``search_on``, or ``None``.
+        replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. A replacing rival starts
+            with the noise of its own residuals. Other given rivals are ignored. ``None``: the likelihood selects poses.
 
     Returns:
         The arguments of :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for the
-        states, and the log-odds of the states against the rivals, infinite for problems without a rival.
+        states, and the log-odds of the states against the rivals. Without a rival, the log-odds are infinite.
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
     with torch.no_grad():
@@ -165,7 +164,7 @@ def reconsider(
     for i in range(_FROZEN + _FREE):
         tried = refine.by_residuals(every, tried, every.votes.known | (i < _FROZEN), step, damping)
     of_ends = every.evidence_at(tried.state)
-    # These tensors have the shape (5, B). The first index is the kind of the rival, or 0 for the refined pose.
+    # The tensors below have the shape (5, B). The first index is the kind of the rival, or 0 for the refined pose.
     kind = kind + 1
     likelihood = found.likelihood.new_full((len(kinds) + 1, len(valid)), -torch.inf)
     end, others = torch.zeros_like(likelihood, dtype=torch.long), likelihood.clone()

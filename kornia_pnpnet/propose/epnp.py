@@ -2,15 +2,15 @@ r"""EPnP: a pose from four or more pairs. A closed-form solution is refined by G
 
 A world point is a combination of control points, :math:`p_i = \sum_j a_{ij} c_j`. The coordinates :math:`a_{ij}` are
 the same in the world frame and in the camera frame. Here :math:`c_0` is the centroid, and :math:`c_1, c_2, c_3` are
-*vectors* from the centroid. These vectors make the coordinates orthonormal, :math:`\sum_i w_i a_i a_i^\top = I`.
-(Lepetit et al. use four points and barycentric coordinates.)
+*vectors* from the centroid. The vectors are chosen so that the coordinates are orthonormal,
+:math:`\sum_i w_i a_i a_i^\top = I`. (Lepetit et al. use four points and barycentric coordinates.)
 
 The projection equations are :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0` and :math:`\sum_j a_{ij} (y_j - v_i z_j) = 0`.
 For given depths :math:`z` of the control points, the least-squares solutions are :math:`x = P z` and :math:`y = Q z`,
 with :math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. Of the paper's 12 unknowns,
-only the four depths remain. Their algebraic error is :math:`z^\top K z`. The columns of :math:`D(z)` and :math:`L` are
-the control vectors in the camera frame and in the world frame. If :math:`D^\top D = L^\top L`, a rotation or a
-reflection maps :math:`L` to :math:`D`. An array (4, C, B) contains the four depths of C candidates.
+only the four depths remain. The algebraic error of the depths is :math:`z^\top K z`. The columns of :math:`D(z)` and of
+:math:`L` are the control vectors in the camera frame and in the world frame. If :math:`D^\top D = L^\top L`, a rotation
+or a reflection maps :math:`L` to :math:`D`. An array (4, C, B) contains the four depths of C candidates.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ _MIN_PAIRS, _MIN_IN_FRONT = 4, 3
 _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Ridge, divided by the squared spread of the pixels. If null vectors have equal algebraic errors, the ridge sorts them:
-# null vectors along the longest extents of the world come first.
+# Size of the ridge of `_null_space`, divided by the squared spread of the pixels. Among null vectors with equal errors,
+# the ridge puts null vectors along the longest extents of the world first.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
 
 
 class ControlPoints(NamedTuple):
-    """Control points, and coordinates and weights of the pairs. The batch is the last dimension in memory."""
+    """Control points, and the coordinates and the weights of the pairs. The batch is the last dimension in memory."""
 
     points: Tensor  # the centroid and three vectors; the last vector of planar points is 0, (B, 4, 3)
     coordinates: Tensor  # the world points are `coordinates @ points`; the last column of planar points is 0, (B, N, 4)
@@ -56,8 +56,8 @@ class ControlPoints(NamedTuple):
 def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    Each of three steps selects the coordinate of the largest variance, and orthogonalises the other coordinates. (The
-    paper's principal directions have no gradient if two extents are equal.) Pairs with the weight 0 are ignored.
+    Each of three steps selects the coordinate with the largest variance, and makes the others orthogonal to the chosen
+    one. Pairs with weight 0 are ignored. (The paper's principal directions have no gradient if two extents are equal.)
 
     Example:
         >>> world = torch.tensor([[[4.0, 0, 0], [-4, 0, 0], [0, 2, 0], [0, -2, 0]]])
@@ -94,22 +94,21 @@ class EPnP(Initialiser):
     r"""EPnP with weights, planar points and gradients, for batches.
 
     The control points in the camera frame are a combination of the null vectors of the projection equations. The
-    coefficients have to preserve the distances between the control points. Gauss-Newton starts from four cases, with
-    one to four null vectors. The case with the smallest weighted reprojection error is aligned by orthogonal
-    Procrustes.
+    coefficients have to preserve the distances between the control points. Gauss-Newton starts from four cases, which
+    combine one, two, three and four null vectors. The case with the smallest weighted reprojection error is aligned
+    with the world by orthogonal Procrustes.
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
-    Four things differ. Two thirds of the unknowns are eliminated (see the module). The centroid has depth 0 in all but
-    one null vector. The objective does not depend on the choice of the control points, and includes the algebraic
-    error. Planar points use the same equations, with 0 as the last vector.
+    Four things differ from the paper. Two thirds of the unknowns are eliminated (see the module). The centroid has
+    depth 0 in all but one null vector. The objective includes the algebraic error, and does not depend on the choice of
+    the control points. Planar points use the same equations, with 0 as the last control vector.
 
     Four or five pairs can have up to four solutions. The solution with the least reprojection error may then be
     incorrect. A problem is not ``ok`` with fewer than four pairs, with points on a line, or with fewer than three pairs
     in front of the camera. The gradient of the pose follows from the implicit function theorem.
 
     Args:
-        iterations: number of Gauss-Newton steps, at least 2. Each case takes two steps, and the best case takes the
-            remaining steps.
+        iterations: number of Gauss-Newton steps, at least 2. Each case takes two steps; the best case takes the rest.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
             distances, in a world with a root mean square radius of 1. The paper's weight is 0.
 
@@ -136,7 +135,7 @@ class EPnP(Initialiser):
         self.algebraic_weight = algebraic_weight
 
     def forward(self, problem: Problem) -> Starts:
-        """Find the pose in the solver's frame. All returned weights are 1. Poses that are not ``ok`` are finite too."""
+        """Find the pose in the solver's frame. All returned weights are 1, and all returned poses are finite."""
         problem = problem._replace(weights=problem.usual_weights)
         control = control_points(problem)
         system = _depth_system(control, problem, self.algebraic_weight)
@@ -149,7 +148,7 @@ class EPnP(Initialiser):
         affine = camera[:, 1:]
         moment = small_product(affine, system.vectors.transpose(0, 1))
         turn, unique = nearest_rotation(moment)
-        # The control vectors have approximate lengths. The scale restores the known size of the world.
+        # In the camera frame, the control vectors have approximate lengths. The scale restores the world's size.
         size = affine.square().sum((0, 1))
         scale = (turn * moment).sum((0, 1)) / torch.where(size > 0, size, 1.0)
         rotation = turn.permute(2, 0, 1).contiguous()
@@ -163,10 +162,10 @@ class EPnP(Initialiser):
         return Starts(Pose(rotation, translation), torch.ones_like(problem.weights), ok)
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
-        """Depths (4, 1, B) of the best case, and whether it is valid (B,). If invalid, all points have equal depths."""
+        """Depths (4, 1, B) of the best case, and whether the case is valid (B,). If not, points have equal depths."""
         cases = _four_cases(system).detach()  # `no_grad` does not stop forward-mode derivatives
-        # A shape and its mirror image along the optical axis have the same distances. Gauss-Newton cannot move
-        # from one shape to the other shape, and therefore starts from both shapes.
+        # A shape and its mirror image along the optical axis have equal distances between points. Gauss-Newton cannot
+        # move from one shape to the other shape, and therefore starts from both shapes.
         mirrored = torch.cat((cases[:1, -1:], -cases[1:, -1:]))
         cases = _minimize(system, torch.cat((cases, mirrored), 1), _CASE_ITERATIONS)
         best = cases.gather(1, _best_case(system, cases).expand(4, 1, -1))
@@ -196,7 +195,7 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
     plane_points = (problem.img_points / problem.focal).mT  # (B, 2, N)
     scaled = (plane_points[:, :, None] * coordinates[:, None]).flatten(1, 2)  # (B, 8, N)
     moments = torch.bmm(scaled, (weights * coordinates).mT)  # P and Q, (B, 8, 4)
-    # K is a sum of squared residuals, because a difference of moments would lose all digits in float32.
+    # K is computed from squared residuals, because a difference of moments would lose all digits in float32.
     errors = (scaled - torch.bmm(moments, coordinates)).unflatten(1, (2, 4)).transpose(1, 2)  # (B, 4, 2, N)
     error = torch.bmm((weights[:, None] * errors).flatten(2), errors.flatten(2).mT).permute(1, 2, 0)
     eye = torch.eye(4, dtype=weights.dtype, device=weights.device)
@@ -217,9 +216,9 @@ def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
 
 
 def _null_space(system: _DepthSystem) -> Tensor:
-    """A basis v of the depths, z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄, (4, 4 vectors, B), in which K is nearly diagonal.
+    """A basis v (4, 4 vectors, B) of the depths z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄ that makes K nearly diagonal.
 
-    The centroid has the depth 1 in v₁, and 0 in v₂, v₃ and v₄. The algebraic errors of v₂, v₃ and v₄ ascend.
+    The centroid has the depth 1 in v₁, and the depth 0 in v₂, v₃ and v₄. The algebraic errors of v₂, v₃ and v₄ ascend.
     """
     error, eye = system.error, torch.eye(4, dtype=system.error.dtype, device=system.error.device)[..., None]
     spread = error[0, 0] + system.maps[:2, 0, 1:, 0].square().sum((0, 1))
@@ -234,7 +233,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
     r"""The depths (4, 4 cases, B) of the paper's four cases, with 1, 2, 3 and 4 null vectors.
 
     Linear least squares find products of the coefficients :math:`\beta`. Six equations determine at most six products.
-    Small products such as :math:`\beta_3^2` are ignored. All linear systems are leading blocks of one system.
+    Small products such as :math:`\beta_3^2` are ignored. The four linear systems are leading blocks of one system.
     """
     basis = _null_space(system)
     vectors = _in_camera(system, basis)[:, 1:]  # (3 axes, 3 vectors, 4 null vectors, B)
@@ -255,7 +254,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
 
 
 def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Half the matrix (4, 4, C, B), half the gradient (4, C, B) and misfit DᵀD - LᵀL (3, 3, C, B) of `_minimize`."""
+    r"""For `_minimize`: half the matrix (4, 4, C, B), half the gradient (4, C, B), and DᵀD - LᵀL (3, 3, C, B)."""
     vectors = _in_camera(system, depths)[:, 1:]
     columns = vectors.transpose(0, 1)
     misfit = small_product(columns, vectors) - system.gram
@@ -267,7 +266,7 @@ def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Ten
 
 
 def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
-    r"""Gauss-Newton on :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` (the paper compares six distances)."""
+    r"""Minimise :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` by Gauss-Newton steps (paper: six distances)."""
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(system, depths)
         (step,) = solve_leading([row.unbind(0) for row in normal.unbind(0)], gradient.unbind(0), (4,))
@@ -276,7 +275,7 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 
 
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
-    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem, or 0 where a minimum is not isolated.
+    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem. They are 0 if a minimum is not isolated.
 
     Two Newton steps with a constant matrix make first and second derivatives exact. The values do not change.
     """
@@ -284,7 +283,7 @@ def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Te
         normal, _, misfit = _normal_equations(system, depths)
         for rows in system.maps[:, 1:].unbind(0):
             normal = normal + 2.0 * small_product(rows.transpose(0, 1), small_product(misfit, rows))
-        # The last control vector of planar points is 0. A 1 on the diagonal makes the system regular.
+        # The last control vector of planar points is 0. A 1 on the diagonal makes their system regular.
         normal[3, 3] += planar
         eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None].expand_as(normal[:, :, 0])
         columns, solved = solve_positive(normal.expand(-1, -1, 4, -1).flatten(2), eye.flatten(1), depths.new_zeros(()))

@@ -26,7 +26,7 @@ _SEEN = 0.25
 # Inlier threshold for rigs, in focal lengths.
 _THRESHOLD = 0.01
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, final_steps=0)
-# If the effort is fixed: number of samples that RANSAC solves, and number of pairs that score each pose.
+# If the effort is fixed, RANSAC solves _SAMPLES samples of each problem, and _JUDGES pairs score each pose.
 _SAMPLES, _JUDGES = 128, 32
 # The root r of x^4 = x + 1. Multiples of (1/r, 1/r^2, 1/r^3), modulo 1, fill the unit cube evenly (M. Roberts, 2018).
 _ROOT = 1.2207440846057596
@@ -45,7 +45,7 @@ def propose(
     """Propose the poses from which refinement starts.
 
     Args:
-        init: the initialiser; ``None``: the refinement starts from the given pose.
+        init: the initialiser, or ``None`` if the refinement starts from the given pose.
         problem: the problem.
         given: the caller's pose in the frame of the problem. This pose competes with the initialiser's poses.
         views: number of views. For rigs, and for initialisers that accept a given pose, this argument has no effect.
@@ -78,7 +78,7 @@ def propose(
 
 @torch.no_grad()
 def _starts_of_rig(problem: Problem, given: Pose | None, *, with_noise: bool, fixed: bool) -> Starts:
-    """Find pose and inliers of a rig, and the noise of the inliers' residuals if ``with_noise``. See `propose`."""
+    """Find the pose and the inliers of a rig. If ``with_noise``, also find the noise of the inliers' residuals."""
     problem = problem.map(torch.Tensor.detach)
     if fixed or not sees_values(problem.weights):
         starts = _of_fixed_effort(problem._replace(weights=relative(problem.weights, problem.weights), noise=None))

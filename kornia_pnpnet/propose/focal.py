@@ -22,16 +22,16 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["as_dist", "distorted", "find_focal", "scale_focal", "with_found_focal", "with_nominal_focal"]
 
-# Shortest and longest focal length of the search, in half widths of the image: fields of view of 118 and 14 degrees.
+# Shortest and longest focal length of the search, in half image widths. The fields of view are 118 and 14 degrees.
 _SHORTEST, _LONGEST = 0.6, 8.0
 # Half of the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
-# If pixels are uniformly distributed in a square image, half the width of the image is the median distance (maximum
-# norm) of the pixels from the centre, times this number.
+# Ratio of half the image width to the median distance (maximum norm) of the pixels from the centre. The ratio is exact
+# for pixels that are uniformly distributed in a square image.
 _HALF_WIDTH = math.sqrt(2.0)
 # Half the range of log f in standard deviations, if the caller expects a focal length.
 _SEARCHED = 2.0
-# Inlier threshold in pixels of the normalised camera: 0.65 % of half the image width at the middle of the range.
+# Inlier threshold in pixels of the normalised camera. At the middle focal length, it is 0.65 % of half the image width.
 _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 # RANSAC for problems that the refinement did not solve. Further iterations of the refinement follow.
@@ -41,7 +41,7 @@ _STEPS = 14
 # Lower bound, in focal lengths, of the kernel's scale in the first step. For example, a distortion of k1 = 0.2 shifts a
 # pixel at a radius of 0.7 by 0.2 * 0.7^3 = 0.07.
 _WIDE = 0.07
-# After each step, this bound is multiplied by _SHRINK, but it never falls below _LEAST.
+# After each step, the lower bound _WIDE is multiplied by _SHRINK, but the bound never falls below _LEAST.
 _SHRINK, _LEAST = 0.6, 1e-5
 
 
@@ -67,7 +67,7 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> 
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
         nominal = expected = math.sqrt(_SHORTEST * _LONGEST) * half
-        width, precision = _WIDTH, 0.0 if radial else None  # the prior of distortion needs a number
+        width, precision = _WIDTH, 0.0 if radial else None  # a prior of the distortion needs a number here
     else:
         nominal, expected = given.detach(), given
         width, precision = min(_SEARCHED * sigma, _WIDTH), sigma**-2
@@ -83,11 +83,10 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
 
 
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
-    """Estimate the focal lengths, and the poses if the caller gave none.
+    """Estimate the focal lengths, and the poses if the caller gave no poses.
 
-    RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length. The
-    ``inputs`` are the result of :func:`with_nominal_focal`. The estimated ``radial`` distortion is removed from the
-    pixels.
+    RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length. If
+    ``radial`` is not 0, distortion is also estimated and removed. ``inputs`` come from :func:`with_nominal_focal`.
     """
     normalize, known = Normalize(order=False), inputs.free_focal
     assert known is not None
@@ -115,9 +114,9 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 @torch.no_grad()
 def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, Tensor]:
-    """Run RANSAC on ``doubted`` problems, bool (B,), whose refined poses are not ``ok``, and replace their states.
+    """Run RANSAC on ``doubted`` problems, bool (B,), and replace their states where RANSAC finds a pose.
 
-    Also returns for which problems RANSAC found a pose, bool (B,). All other problems keep their states.
+    A problem is doubted if its refined pose is not ``ok``. Also returns where RANSAC found a pose, bool (B,).
     """
     rows = doubted.nonzero()[:, 0]
     if not len(rows):
@@ -163,7 +162,7 @@ def as_dist(coefficients: Tensor) -> Tensor:
 def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
     """Estimate pose, focal length and radial distortion by Gauss-Newton steps with a Cauchy kernel.
 
-    The scale of the kernel is proportional to the median residual. The lower bound of this scale shrinks at each step.
+    The scale of the kernel is proportional to the median residual, with a lower bound that shrinks at each step.
     """
     state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
     limit = _WIDE

@@ -15,11 +15,11 @@ __all__ = ["Initialiser", "trait"]
 class Initialiser(Configured):
     """A module that maps a :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
 
-    Any module with this ``forward`` is an initialiser. If the module lacks an attribute, the default below applies.
+    Any module with this ``forward`` is an initialiser. If a module lacks an attribute, this class gives the default.
 
     Attributes:
         pairs_at_once: on a CPU and without gradients, solvers split a batch into parts that fit the CPU's caches. This
-            attribute is the largest number of pairs in a part, per thread. ``None``: batches are not split.
+            attribute is the largest number of pairs in a part, per thread. If ``None``, batches are not split.
         fixed_pairs: whether the number of pairs has to be ``config["n"]``.
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.

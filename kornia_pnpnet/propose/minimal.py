@@ -24,7 +24,7 @@ class MinimalSolver(Protocol):
         """Number of pairs in a sample."""
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Find the poses of samples. A sample is a normalised problem of ``sample_size`` pairs. Weights are ignored.
+        """Find the poses of samples. A sample is a normalised problem of ``sample_size`` pairs.
 
         If the focal length is unknown, the last row of each rotation and of each translation is multiplied by
         ``problem.focal`` and divided by the estimated focal length.
@@ -36,7 +36,7 @@ class SubsetSolver(Configured):
 
     Args:
         init: initialiser, which maps :class:`~kornia_pnpnet.problem.Problem` to :class:`~kornia_pnpnet.problem.Starts`.
-        refine: refines the poses of the initialiser; ``None``: the poses are not refined.
+        refine: refines the poses of the initialiser, or ``None`` for no refinement.
         size: number of pairs in a sample.
 
     Raises:

@@ -17,7 +17,7 @@ __all__ = ["MLPInit", "rotation_about"]
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Module]:
-    """Make linear layers with ReLU and He initialisation. With PyTorch's default, ten narrow layers lose the signal."""
+    """Linear layers with ReLU and He initialisation. Ten narrow layers of PyTorch's default would lose the signal."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         linear = nn.Linear(size_in, size_out)

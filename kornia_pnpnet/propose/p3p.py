@@ -7,16 +7,16 @@ length of the difference of the unit rays :math:`i` and :math:`j`. The law of co
 .. math:: (\lambda_i - \lambda_j)^2 + b_k \lambda_i \lambda_j = a_k.
 
 If weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three equations is a conic in the ratios of
-the distances. Let :math:`s_k` be the squared sines of the angles between the rays, and :math:`g` the squared
-determinant of the rays. Then the conic is a pair of lines when
+the distances. Let :math:`s_k` be the squared sine of the angle between the rays :math:`i` and :math:`j`. Let :math:`g`
+be the squared determinant of the matrix of the three rays. Then the conic is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3.
 
-One root of this cubic gives two lines. Each line intersects the conic of other weights in two points. A Newton step
-then refines the ratios.
+One root of this cubic gives two lines. Each line intersects a second conic, which has other weights, in two points. A
+Newton step then refines the ratios of the distances.
 
-The last dimension of every tensor is a chunk of C problems. Finite values are selected by ``lerp`` with a weight of 0
-or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
+The last dimension of every tensor has the C problems of a chunk. Finite values are selected by ``lerp`` with a weight
+of 0 or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
 """
 
 from __future__ import annotations
@@ -42,28 +42,29 @@ _CHUNK_BYTES = 2**16
 # A candidate is a solution if its triangle differs from the world triangle by less than eps^_ERROR_POWER times the
 # distance of the camera, and by less than _LARGEST_ERROR. The longest edge of the world triangle has the length 1.
 _ERROR_POWER, _LARGEST_ERROR = 2 / 3, 0.01
-# Least distance of the camera from a point, in units of eps^_ERROR_POWER times the longest edge. At a smaller distance,
-# rounding would determine the ray of the point.
+# Least distance of the camera from a point. The unit is eps^_ERROR_POWER times the longest edge. At a smaller distance,
+# rounding errors would decide the direction of the point's ray.
 _CLOSE = 64.0
 # A triangle counts as a line when its height is below _LINE * eps * sqrt(b^2 + d^2). Here b is the longest edge, and d
 # is the distance of the opposite point from the origin.
 _LINE = 32.0
-# Number of Newton steps for the root of the cubic. They reduce a relative error of 37 % to rounding errors of float64.
+# Number of Newton steps for the root of the cubic. The steps reduce a relative error of 37 % to float64 rounding.
 _CUBIC_STEPS = 4
-# A Newton step for the ratios is damped if its squared determinant is below eps^_DAMPING_POWER times the product of two
-# squared edges. When two solutions nearly coincide, rounding errors would dominate the full step.
+# The Newton step for the ratios of the distances is damped if the squared determinant of the step's linear system is
+# below eps^_DAMPING_POWER times the product of two squared edges. When two solutions nearly coincide, rounding errors
+# would dominate the full step.
 _DAMPING_POWER = 1.25
-# Number of focal lengths in the grid of an unknown focal length.
+# Number of focal lengths at which `P3P` solves a sample if the focal length is unknown.
 _FOCALS = 12
 
 
 def _greater(first: Tensor, second: Tensor) -> Tensor:
-    """1.0 where the first is greater, else 0.0."""
+    """1.0 where the first tensor is greater, else 0.0."""
     return torch.gt(first, second, out=torch.empty_like(first))
 
 
 def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Which cyclic shift moves the largest of three values (3, C) to the front: flags (C,) for one and two steps."""
+    """Flags (C,): whether one cyclic step, or two, moves the largest of three values (3, C) to the front."""
     first, second, third = values
     return _greater(second, first), _greater(third, torch.maximum(first, second))
 
@@ -88,8 +89,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """Find the real root ``u : v`` that is farthest from the other two roots of a cubic form with coefficients (4, C).
 
-    If two solutions of P3P nearly coincide, two roots also nearly coincide. The other root gives a line through both
-    solutions.
+    If two solutions of P3P nearly coincide, two roots do so, too. The third root gives a line through both solutions.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -132,7 +132,7 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
     us = (u * u).mul_(torch.addcmul(2.0 * h, h, h, value=-1.0))
     sq_m2, sq_m3 = (us + pairs).neg_().clamp_(min=tiny)
     large = _sqrt(torch.maximum(sq_m2, sq_m3))
-    least = -large  # these bounds have an effect only if the lines are not real
+    least = -large  # `least` and `large` are bounds that matter only if the lines are not real
     small = (e1 * d11).addcmul_(e2, e3).neg_().div_(large).clamp_(least, large)
     third = _greater(sq_m3, sq_m2)
     m2, m3 = large.lerp(small, third), small.lerp(large, third)
@@ -148,7 +148,7 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
 def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
     """Distances (3, 2, 2, C), up to scale, where two lines intersect the conic with the weights ``v`` (3, C).
 
-    A line that misses the conic is treated like a tangent. For a tangent, the second intersection is 0.
+    If a line touches or misses the conic, the distances of its second intersection are 0.
     """
     v1, v2, v3 = v
     vh1, vh2, vh3 = v * h
@@ -169,8 +169,8 @@ def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
 def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
     """Four candidates (3, 2, 2, C) for the distances of a triangle whose edge 1 is the longest and has the length 1.
 
-    ``p`` and ``q`` (C,) are the squared lengths of the edges 3 and 2, and ``r`` is ``1 - p - q`` without rounding. For
-    ``b`` (3, C) and ``g`` (C,) see the module. All candidates are finite, and the first distance is not negative.
+    ``p`` and ``q`` (C,) are the squared lengths of the edges 3 and 2, and ``r`` is ``1 - p - q`` without rounding. The
+    module defines ``b`` (3, C) and ``g`` (C,). All candidates are finite, and their first distance is not negative.
     """
     h = 0.5 * b
     s1, s2, s3 = torch.addcmul(b, h, h, value=-1.0)
@@ -181,7 +181,7 @@ def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
     u = torch.stack(((p * u3).addcmul_(q, u2).neg_(), u2, u3))
     pairs = (u2 * u3).addcmul_(u[0], u2 + u3)
     turn = _turn_to_largest((u.roll(-1, 0) + u.roll(1, 0)).abs_())
-    # The weights of the second conic, (p u_2 - q u_3, u_3, -u_2), are orthogonal to u.
+    # The weights v of the second conic satisfy a · v = 0, and (v_2, v_3) is orthogonal to (u_2, u_3).
     v = torch.stack(((p * u2).addcmul_(q, u3, value=-1.0), u3, -u2))
     u, v, h = _turned(torch.stack((u, v, h), 1), turn).unbind(1)
     slope, offset = _lines(u, h, pairs)
@@ -217,7 +217,6 @@ def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
 
 
 def _dot(v: Tensor, w: Tensor) -> Tensor:
-    """Dot products of vectors (3, *, C)."""
     return (v * w).sum(0)
 
 
@@ -227,7 +226,7 @@ def _cross(v: Tensor, w: Tensor) -> Tensor:
 
 
 def _axes(base: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """For triangles given by a base and another side, both (3, *, C), compute lengths and directions.
+    """Compute directions and lengths of triangles from a base (3, *, C) and another side (3, *, C).
 
     Returns five values: the unit vector along the base; the unit vector along the height; the inverse of the base's
     length; the component of the side along the base; the squared height.
@@ -274,13 +273,13 @@ def _solve_chunk(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Te
     base_length = inv_base.reciprocal()
     y1, y2, y3 = (dist * base_length)[:, None] * rays[:, :, None, None]
     cam1, cam2, cam_inv_base, cam_along, cam_sq_height = _axes(y3 - y2, y1 - y2)
-    # The camera triangle is compared with the world triangle, relative to the base of the world triangle.
+    # The errors of the camera triangle are relative to the base of the world triangle.
     base_error = (cam_inv_base * base_length).sub_(1.0)
     along_error = torch.addcmul(-along, cam_along, inv_base)
     height_error = torch.addcmul(-sq_height, cam_sq_height, inv_sq_base)
     sq_error = base_error.mul_(base_error).addcmul_(along_error, along_error).addcmul_(height_error, height_error)
     least = dist.amin(0)
-    # No distance exceeds dist[0] + 1, because the longest edge is 1.
+    # No distance exceeds dist[0] + 1, because the longest edge has the length 1.
     room = torch.addcmul(least, least, dist[0]).sub_(_CLOSE * finfo.eps**_ERROR_POWER)
     room.mul_(sound).mul_(finfo.eps ** (2 * _ERROR_POWER)).clamp_(max=_LARGEST_ERROR**2)
 
@@ -333,10 +332,10 @@ class _Solve(torch.autograd.Function):
 
 
 def minimal_poses(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`p3p` for points (B, 3, 3) and (B, 3, 2) of one dtype.
+    """Solve P3P for world points (B, 3, 3) and plane points (B, 3, 2) of one dtype, see :func:`p3p`.
 
-    The fifth powers of coordinates must not overflow or underflow. Returns the entries (12, 4, B) of
-    :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which slots are valid, (4, B).
+    The fifth powers of coordinates must not overflow or underflow. Returns four poses as entries (12, 4, B), see
+    :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which of the four slots are valid, (4, B).
     """
     entries, valid = (_solve if compiling() else _Solve.apply)(world_points.detach(), plane_points.detach())
     return entries, valid
@@ -399,8 +398,8 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
 class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
-    If the focal length is unknown, :func:`p3p` solves each sample at every focal length of a grid with constant ratios
-    (see :class:`~kornia_pnpnet.refine.terms.CameraTerm`). The refinement finds values between those of the grid.
+    If the focal length is unknown, each sample is solved at every focal length of a geometric grid (see
+    :class:`~kornia_pnpnet.refine.terms.CameraTerm`). The refinement then finds focal lengths between those of the grid.
 
     Example:
         >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))
@@ -415,7 +414,7 @@ class P3P(Configured):
         super().__init__(locals())
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Four slots per sample, or per sample and focal length of the grid. See MinimalSolver.hypotheses."""
+        """Four slots per sample and tried focal length. See MinimalSolver.hypotheses."""
         world, plane = problem.world_points, problem.img_points / problem.focal
         if problem.free_focal is None:
             entries, valid = minimal_poses(world, plane)

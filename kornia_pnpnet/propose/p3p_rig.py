@@ -1,4 +1,4 @@
-r"""Minimal solver of three pairs of a rig: several cameras, or one camera with bearings in any direction.
+r"""Minimal solver of three pairs of a rig. A rig is several cameras, or one camera with bearings in any direction.
 
 A pair consists of a world point :math:`x_k` and a ray, which starts at the camera centre :math:`c_k` and has the unit
 direction :math:`r_k`. The unknowns are the distances :math:`d_k > 0` along the rays. The triangle of the points
@@ -7,11 +7,11 @@ direction :math:`r_k`. The unknowns are the distances :math:`d_k > 0` along the 
 .. math:: \|c_i + d_i r_i - c_j - d_j r_j\|^2 = \|x_i - x_j\|^2.
 
 There are up to eight solutions (D. Nistér, "A minimal solution to the generalised 3-point pose problem", CVPR 2004).
-For a given :math:`d_1`, one equation has up to two solutions :math:`d_2`, and another has up to two solutions
-:math:`d_3`. All four are real in one interval of :math:`d_1`. On each of the four branches, the third equation is a
-function of :math:`d_1` alone. Newton's method starts where the sign of one of these functions changes.
+For a given :math:`d_1`, one equation gives up to two :math:`d_2`, and another equation gives up to two :math:`d_3`. All
+four solutions are real in one interval of :math:`d_1`. On each branch, a choice of :math:`d_2` and :math:`d_3`, the
+third equation is a function of :math:`d_1` alone. Newton's method starts where one of these functions changes its sign.
 
-The last dimension of every tensor is the batch of B problems or M solutions.
+The last dimension of every tensor has B problems or M solutions.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from kornia_pnpnet.propose.scoring import as_pose
 
 __all__ = ["P3PRig"]
 
-# Number of distances d_1 at which each function is evaluated. Two solutions between neighbouring distances are missed.
-# If cameras look in all directions, 4 % of the poses are missed.
+# Number of distances d_1 at which the third equation of each branch is evaluated. Two solutions between neighbouring
+# distances are missed. If cameras look in all directions, 4 % of the poses are missed.
 _DISTANCES = 16
 # Largest number of solutions, and number of Newton steps.
 _SOLUTIONS, _STEPS = 8, 6
@@ -60,7 +60,7 @@ class _Branches(NamedTuple):
         return cls(ahead, 1.0 + gain, offset - ahead * ray, change - gain * ray, sq_side)
 
     def interval(self) -> tuple[Tensor, Tensor]:
-        """Least and largest distance of pair 1 with real solutions. If none is real, the least exceeds the largest."""
+        """Least and largest distance of pair 1 with real solutions. The least is larger if no solution is real."""
         sq_tilt = self.tilt.square().sum(0).clamp(min=torch.finfo(self.tilt.dtype).eps ** 2)  # for parallel rays
         middle = -(self.aside * self.tilt).sum(0) / sq_tilt
         sq_half = middle.square() + (self.sq_side - self.aside.square().sum(0)) / sq_tilt
@@ -68,7 +68,7 @@ class _Branches(NamedTuple):
         return middle - half, middle + half
 
     def at(self, distance: Tensor, sign: Tensor) -> Tensor:
-        """The distances of pair k at distances of pair 1, (D, M) or (M,). The sign, -1 or 1, selects the solution."""
+        """Distances of pair k for distances (D, M) or (M,) of pair 1. The sign, -1 or 1, selects the solution."""
         sq_aside = sum((x + y * distance).square() for x, y in zip(self.aside, self.tilt, strict=True))
         return self.ahead + self.cosine * distance + sign * (self.sq_side - sq_aside).clamp(min=0.0).sqrt()
 
@@ -84,8 +84,7 @@ class P3PRig:
         problem = problems_last(problem)
         assert problem.rig is not None
         batch = problem.weights.shape[0]
-        # The dimensions are pairs, coordinates and problems, (3, 3, B).
-        world, rays, back = (
+        world, rays, back = (  # each (3 pairs, 3 coordinates, B)
             x.permute(1, 2, 0).contiguous() for x in (problem.world_points, problem.places, problem.rig.translation)
         )
         rays = rays / rays.square().sum(1, keepdim=True).sqrt()  # in the frame of the rig
@@ -108,13 +107,13 @@ class P3PRig:
 def _starts(
     branches: list[_Branches], rays: Tensor, centres: Tensor, sq_side: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Starts of Newton's method: distances (M,) of pair 1, signs (2, M) of branches, slots (M,) and problems (M,)."""
+    """Starts of Newton's method: distances (M,) of pair 1, signs (2, M) of the branches, slots (M,), problems (M,)."""
     batch, device = sq_side.shape[0], sq_side.device
     lows, highs = zip(*(x.interval() for x in branches), strict=True)
     low, high = torch.maximum(*lows).clamp(min=0.0), torch.minimum(*highs)
     real = high > low
     middle, half = 0.5 * (low + high), torch.where(real, 0.5 * (high - low), 0.0)
-    # At an end of the interval, d_2 and d_3 behave like square roots. They are smooth functions of the angle `turn`.
+    # At an end of the interval, d_2 and d_3 behave like square roots. As functions of arcsin(`turn`), both are smooth.
     turn = torch.linspace(-0.5 * math.pi, 0.5 * math.pi, _DISTANCES, dtype=sq_side.dtype, device=device).sin()[:, None]
     distances = middle + half * turn  # (D, B)
     signs = torch.tensor([-1.0, 1.0], dtype=sq_side.dtype, device=device)[:, None, None]
@@ -123,7 +122,7 @@ def _starts(
     linear = (2.0 * offset * rays[1:]).sum(1)  # (2, B)
     wide = (rays[1] - rays[2]).square().sum(0)
     alone = linear[0] * second + (offset.square().sum(0) - sq_side), linear[1] * third
-    # `gap` is the error of the third equation. The square of a difference and `wide` lose no digits in a narrow view.
+    # `gap` is the error of the third equation. In this form, the error loses no digits in a narrow view.
     gap = (second[:, None] - third).square() + (wide * second)[:, None] * third + (alone[0][:, None] - alone[1])
     above = gap.flatten(0, 1) > 0  # (4, D, B)
     changes = ((above[:, 1:] != above[:, :-1]) & real).flatten(0, 1)  # (4 (D - 1), B)
@@ -144,7 +143,7 @@ def _starts(
 def _newton(
     world_points: Tensor, rays: Tensor, centres: Tensor, sides: Tensor, ranges: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations, translations, and whether both are a solution, by Newton's method from distances ``ranges`` (3, M)."""
+    """Newton's method from distances ``ranges`` (3, M): rotations, translations, and which poses are solutions."""
     first, second = [0, 0, 1], [1, 2, 2]
     for step in range(_STEPS + 1):
         points = centres + ranges[:, None] * rays

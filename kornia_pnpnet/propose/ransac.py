@@ -28,14 +28,14 @@ _FITTED = 5
 # Largest residuals of an inlier in `search_on`, in standard deviations. The first limit is for noise that a network
 # estimates. Such estimates are too small when most pairs are outliers. The second limit is for the caller's noise.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
-# For an unknown focal length, the inlier threshold is at least this number, times the median distance of the pixels
-# from the principal point, times half the range of log f. Tuned on random problems with fields of view of 18 to 100
-# degrees (seed 6).
+# For an unknown focal length, the inlier threshold is at least the product of this number, half the range of log f, and
+# the median distance of the pixels from the principal point. The number was tuned on random problems with fields of
+# view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# Lower bound, in normalised units, of the depth at which `search_on` converts noise of points to pixels.
+# `search_on` converts noise of points to pixels at the depth of a pose, but at least at this depth (normalised units).
 _NEAREST = 0.5
-# _DOUBT: chance to draw a pair of weight 0, divided by that of a pair of weight 1. _LEAST_TRUST: the same ratio for
-# confidences 0 and 1. This ratio is smaller, because a caller's confidences are more reliable than a network's weights.
+# _DOUBT is the chance to draw a pair of weight 0 over the chance to draw a pair of weight 1. _LEAST_TRUST is this ratio
+# for confidences 0 and 1, and smaller, because a caller's confidences are more reliable than a network's weights.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
@@ -49,9 +49,9 @@ class RANSAC(Initialiser):
     does not depend on the batch. Pairs of a large confidence are drawn more often than other pairs.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
-    least squares, the weight of an inlier is the inverse of the right-hand side. The final steps multiply this weight
-    by the weight of a Cauchy kernel. These steps start from a constant pose close to the minimum, and have gradients
-    with respect to points, pixels and weights. The choice of inliers, and the right-hand side, have no gradient.
+    least squares, the weight of an inlier is the inverse of the right-hand side of this inequality. The final steps
+    multiply this weight by that of a Cauchy kernel. The steps start from a constant pose close to the minimum, and have
+    gradients with respect to points, pixels and weights. The choice of inliers and the right-hand side are constant.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
@@ -167,7 +167,7 @@ class RANSAC(Initialiser):
         return Starts(pose, judged.weights.contiguous(), search.loss.isfinite(), camera=camera)
 
     def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[Projection, Judged]:
-        """Improve poses on their inliers. Each stage selects the inliers once, by its own thresholds."""
+        """Improve poses on their inliers. Each stage selects the inliers once, with the thresholds of the stage."""
         projection = project(state, problem)
         for thresholds in stages:
             judged = judge(projection, problem, thresholds)
@@ -183,7 +183,7 @@ def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
     """Weights (B, N) of a Cauchy kernel. The inliers' median residual gives the scale, because thresholds are wide."""
     there = inliers > 0
     sq_scale = cauchy_scale(errors, there).clamp(min=torch.finfo(errors.dtype).eps)
-    # With few inliers, the median residual underestimates the noise. All weights are then closer to 1.
+    # With few inliers, the median residual underestimates the noise, so that all weights are set closer to 1.
     count = there.sum(-1, keepdim=True, dtype=errors.dtype)
     return 1.0 / (1.0 + (count - _FITTED).clamp(min=0) / count.clamp(min=1) * errors / sq_scale)
 
@@ -206,10 +206,10 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     more than 64 samples for a confidence of 0.999. A pair of the weight :math:`w` in the starts is drawn with a chance
     proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
-    A pair is an inlier if its residual is below ten standard deviations, or below five if the caller gave the noise of
-    the pair. If the caller gave no noise, all pairs have the mean of the estimated standard deviations. Noise of points
-    is converted to pixels at the depth of the world's origin in the first pose. If each pose used its own depths, a
-    pose close to the points would have the most inliers.
+    A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
+    limit is five standard deviations. If the caller gave no noise, all pairs have the same standard deviation, the mean
+    of the estimates. Noise of points is converted to pixels at the depth of the world's origin in the first pose. If
+    each pose used its own depths, a pose close to the points would have the most inliers.
 
     Args:
         problem: normalised problems of a centred and scaled world.
@@ -217,9 +217,9 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
         keep_others: whether to keep the other poses of the starts. With few pairs, the best pose can be incorrect.
 
     Returns:
-        First, the starts with the best pose, without gradient. In a searched problem, a Cauchy kernel at the best pose,
-        with the inlier threshold as its scale, gives the weights. Second, the pose with the least loss at a quarter of
-        the thresholds, for the comparison with the refined pose (`reconsider`).
+        First, the starts with the best pose, without gradient. In a searched problem, the weights are those of a Cauchy
+        kernel at the best pose, with the inlier threshold as its scale. Second, the pose with the least loss at a
+        quarter of the thresholds, for the comparison with the refined pose (see `reconsider`).
 
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.

@@ -1,6 +1,6 @@
 r"""EPPnP and REPPnP: a pose from the null space of the projection equations. REPPnP also rejects outliers.
 
-A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. Their residuals are the algebraic
+A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. The residuals are the algebraic
 errors. The unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). In an
 array ``rows`` (B, K + 1, 2 N), the first K rows hold the derivatives of the errors with respect to K unknowns, and the
 last row holds the errors. In each row, N entries for u precede N entries for v.
@@ -26,8 +26,8 @@ __all__ = ["REPPnP"]
 
 # Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
-# Outlier rejection keeps at least this number of pairs: one more than the 6 pairs that determine a null vector, or two
-# more than the 3 pairs that determine a rigid motion.
+# Least numbers of pairs that outlier rejection keeps: with the null vector, which 6 pairs determine, and with the rigid
+# motion, which 3 pairs determine.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
 # A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4
@@ -46,14 +46,14 @@ class REPPnP(Initialiser):
     last null vector is aligned with the world by orthogonal Procrustes. Without rejection the method is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
-    Rejection", CVPR 2014. Our changes improve success or allow batches:
+    Rejection", CVPR 2014. Our changes raise the success rate or allow batches:
 
     - The null vector is scaled so that the centroid has depth 1. (In the paper, the vector has length 1.) The vector
       solves a linear system, and does not depend on the control points, the frame or the unit. A small ridge pulls all
       points toward the depth of the centroid, which reduces the effect of outliers.
     - Outliers are rejected by their leave-one-out error. The quantile is 50 % (paper: 25 %).
-    - A second loop rejects outliers of a rigid motion, fitted by Gauss-Newton to the algebraic error. The final pose
-      minimises this error. The paper alternates between a combination of four null vectors and a rigid motion.
+    - A second loop fits a rigid motion by Gauss-Newton on the algebraic error, and rejects outliers of this motion. The
+      final pose minimises the error. The paper alternates between combinations of four null vectors and rigid motions.
     - Both loops have a fixed length. The paper's loop stops when the quantile no longer decreases.
 
     The selection of pairs has no gradient. The last Gauss-Newton steps start from a detached pose, and their gradient
@@ -61,7 +61,7 @@ class REPPnP(Initialiser):
 
     Args:
         reject_outliers: whether outliers are rejected. If ``False``, all pairs are kept.
-        max_error: :math:`\delta_{\max}` as a share of the root mean square radius of the world.
+        max_error: :math:`\delta_{\max}`, divided by the root mean square radius of the world.
         quantile: smallest ratio of kept pairs to all pairs, in (0, 1].
         refine_iterations: number of Gauss-Newton steps after the last rejection, at least 1.
 
@@ -101,8 +101,8 @@ class REPPnP(Initialiser):
 
         Returns:
             The pose, weights, and ``ok``. The weight is 1 for kept pairs and for unusual pairs (see ``Problem.usual``),
-            and 0 for other pairs. A problem is not ``ok`` with fewer than 4 pairs, with points on a line, if the
-            equations do not determine a pose, or if the centroid of the points is behind the camera.
+            and 0 for other pairs. A problem is not ``ok`` with fewer than 4 pairs, with points on a line, with
+            equations that do not determine a pose, or with the centroid of the points behind the camera.
         """
         problem = problem._replace(weights=problem.usual_weights)
         with torch.no_grad():
@@ -135,8 +135,8 @@ class REPPnP(Initialiser):
     def _select(self, pairs: _Pairs, control: ControlPoints) -> tuple[Tensor, Pose]:
         """Return weights, which are 0 for outliers, and the pose of the kept pairs in the frame of :class:`_Pairs`."""
         coordinates = control.coordinates.mT.contiguous()  # (B, 4, N)
-        # The mean is subtracted from the pixels. This shear of the camera frame does not change the algebraic errors.
-        # In a narrow view the shear reduces rounding.
+        # Subtracting the mean from the pixels is a shear of the camera frame. The shear does not change the algebraic
+        # errors. In a narrow view, the shear reduces rounding errors.
         mean = (control.weights[:, None] * pairs.plane).sum(-1, keepdim=True)  # (B, 2, 1)
         zero = torch.zeros_like(coordinates)
         by_x, by_y = torch.cat((coordinates, zero), -1), torch.cat((zero, coordinates), -1)
@@ -148,7 +148,7 @@ class REPPnP(Initialiser):
             errors = _leave_one_out(torch.cat((rows[:, :-1], null.mT @ rows), 1), inverse, pairs, weights)
             sq_size = null[:, 2:-1].square().sum(1).clamp(min=torch.finfo(null.dtype).eps ** 2)
             weights = self._keep(pairs, errors / sq_size, _NULL_FLOOR)
-        # Find the pose that maps the world points to the camera points that the last null vector describes.
+        # Align the world points with the camera points of the last null vector.
         _, null = _null_vector(rows, weights, _FINAL_DEPTH_PRIOR)
         centroid, vectors = torch.cat((null[:, :2], null[:, -1:]), 1), null[:, 2:-1].view(-1, 3, 3)
         camera = torch.cat((centroid, vectors), 2)  # (B, 3, 4)
@@ -165,7 +165,7 @@ class REPPnP(Initialiser):
         return weights, pose
 
     def _keep(self, pairs: _Pairs, sq_error: Tensor, floor: int) -> Tensor:
-        """Weights (B, N), 0 if the error exceeds the quantile and the limit. At least ``floor`` pairs are kept."""
+        """Weights (B, N), 0 if the error exceeds the quantile and ``max_error``. At least ``floor`` pairs are kept."""
         count = pairs.there.sum(-1, keepdim=True, dtype=sq_error.dtype)  # (B, 1)
         rank = (self.quantile * count).ceil().long().clamp(min=floor)
         rank = rank.clamp(max=sq_error.shape[-1]) - 1
@@ -175,7 +175,7 @@ class REPPnP(Initialiser):
 
 
 class _Pairs(NamedTuple):
-    """Pairs. The world points have the centroid 0 and the root mean square radius 1."""
+    """Pairs whose world points have the centroid 0 and the root mean square radius 1."""
 
     world: Tensor  # (B, 3, N)
     plane: Tensor  # u and v, pixels over the focal length, (B, 2, N)
@@ -189,7 +189,7 @@ def _normal_matrix(rows: Tensor, weights: Tensor) -> Tensor:
 
 
 def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
-    """Invert the sum of the normal matrix, a ridge and a tiny number. The tiny number makes the inverse exist."""
+    """Invert the normal matrix plus a ridge. A tiny number on the diagonal makes the inverse exist."""
     ridge = torch.diag_embed(normal.new_zeros(normal.shape[1]) + ridge + 32.0 * torch.finfo(normal.dtype).eps)
     return torch.linalg.inv_ex(normal[..., :-1] + ridge).inverse
 
@@ -217,7 +217,6 @@ def _linearize(pairs: _Pairs, pose: Pose) -> Tensor:
 
 
 def _step(pose: Pose, normal: Tensor) -> Pose:
-    """Take a Gauss-Newton step."""
     return retract(pose, -(_inverse(normal) @ normal[..., 6:])[..., 0])
 
 

@@ -15,8 +15,8 @@ from kornia_pnpnet.core.performance import present_first
 
 __all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed", "spread_evenly"]
 
-# Number of nearest neighbours that are compared for each pair, and largest number of pairs among which neighbours are
-# searched, so that the cost is linear in the number of pairs. The second number is a power of two for the bit masks.
+# For each pair, _NEIGHBOURS nearest neighbours among at most _CANDIDATES pairs are compared, so that the cost is linear
+# in the number of pairs. _CANDIDATES is a power of two because of the bit masks.
 _NEIGHBOURS, _CANDIDATES = 16, 512
 # The bits of the float32 infinity, read as an integer.
 _INFINITE = 0x7F800000
@@ -33,7 +33,7 @@ def kept_at_once(count: int, like: Tensor) -> int:
 
 @torch.no_grad()
 def spread_evenly(present: Tensor, count: int) -> Tensor:
-    """Indices (B, count) of present pairs, evenly spread. If fewer than ``count`` are present, absent pairs follow.
+    """Indices (B, count) of evenly spread present pairs. If fewer than ``count`` pairs are present, absent ones follow.
 
     Multiples of the golden ratio shift the positions slightly, so that the selection does not follow a periodic pattern
     in the order of the pairs. No position occurs twice, unless the problem has fewer than ``count`` pairs.
@@ -149,7 +149,7 @@ class Samples:
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
 
-        Unequal chances count as n equal chances. Here 1 / n is the mean chance of the inliers, weighted by the chances.
+        Unequal chances p (of sum 1) count as n equal chances, where 1 / n = sum(p^2) / sum(p) over the inliers.
         """
         share = torch.where(inliers, self._share[problems], 0.0)
         mass = share.sum(-1)
@@ -184,7 +184,7 @@ def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float
     r"""Number of samples needed for a probability ``confidence`` that at least one sample has no outlier, float64 (B,).
 
     The number is :math:`\log(1-p) / \log(1-w)` for the confidence :math:`p`. The share of samples without an outlier is
-    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs (both may be fractions)
+    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs (the counts may be fractions)
     (M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B).
     """
     drawn = torch.arange(size, dtype=torch.float64, device=inliers.device)

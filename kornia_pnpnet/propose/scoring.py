@@ -1,11 +1,11 @@
 r"""Compute the losses of thousands of poses per problem at once.
 
-A pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame have the standardised squared residual (see
-:mod:`kornia_pnpnet.judge.inliers`; numerator and denominator are multiplied by :math:`(z/f)^2`)
+A pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame have the standardised squared residual
 
 .. math:: e = \frac{(x - z\,b_u/f)^2 + (y - z\,b_v/f)^2}{(z \tau / f)^2 + \omega^2}
 
-One matrix product projects all points at all poses.
+The definition is in :mod:`kornia_pnpnet.judge.inliers`. Here, numerator and denominator are multiplied by
+:math:`(z/f)^2`. One matrix product projects all points at all poses.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 
-#: Maps standardised squared residuals of any shape to losses of the pairs.
+#: A function that maps standardised squared residuals of any shape to losses of the pairs.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
-# For a point behind the camera, this number times |depth| is added to the numerator, so that e exceeds MAX_ERROR.
+# For a point behind the camera, the numerator of e grows by this number times |depth|, so that e exceeds MAX_ERROR.
 _BEHIND = 1e15
 
 

@@ -31,10 +31,10 @@ CAUCHY = 3.4
 _DTYPE = torch.float32
 # Largest number of samples that a CPU solves and scores at once, so that the tensors fit into a core's caches.
 _SAMPLES_AT_ONCE = 8192
-# A round has _GROWTH times as many samples as all earlier rounds together, but at most _LARGEST_ROUND.
+# A round has _GROWTH times as many samples as all earlier rounds, at least `min_samples`, and at most _LARGEST_ROUND.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
-# A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds, or are at most _FEW_SAMPLES. With few
-# pairs, the pose then does not depend on the order of the pairs, and rounding does not decide when the search ends.
+# If the remaining samples fill at most _ROUNDS_LEFT rounds, or are at most _FEW_SAMPLES, a round draws all of them.
+# With few pairs, the pose then does not depend on the order of pairs, and rounding does not decide when a search ends.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
 # After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, but at least _FIRST_PAIRS. If k
 # samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then 3 / w pairs
@@ -43,16 +43,16 @@ _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 # After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
 # were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
-# If a problem has at most this product of slots and pairs, scoring the empty slots is faster than removing them.
+# If (slots for poses) x (pairs) is at most this number, scoring the empty slots is faster than removing them.
 _FEW_RESIDUALS = 4096
-# Number of poses with the smallest losses that each round improves. The best improved pose is then improved again.
+# Each round improves this number of poses with the smallest losses. The best improved pose is then improved again.
 _IMPROVED = 3
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
-# Squared ratio of the thresholds to the narrower thresholds of a rival.
+# Squared inlier threshold, divided by the square of the narrower threshold at which rivals are scored.
 _NARROWER = 16.0
-# The sum of the products of the entries of a rotation and of its Newton step is 3. If this sum differs from 3 by at
-# least this number, the matrix is no rotation.
+# The entrywise product of a rotation and of the rotation after a Newton step sums to 3. If the sum for a matrix differs
+# from 3 by at least this number, the matrix is no rotation.
 _FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step, small because the start is close to the minimum.
 _DAMPING = 1e-6
@@ -62,8 +62,8 @@ _LIMITS = 3.0, 1.0
 # If `pose_sigma` exceeds _OPEN, an incorrect pose may have as many inliers as the correct pose, for example in a flat
 # scene and a narrow field of view. At least _OPEN_SAMPLES samples are then drawn.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
-# After this number of samples, the chance that a pair is drawn is multiplied by (a + agreement)^b. These first
-# samples take as long as `agreement_of_neighbours`. The numbers a and b were chosen empirically.
+# After _PLAIN_SAMPLES samples, which take as long as `agreement_of_neighbours`, the chance that a pair is drawn is
+# multiplied by (a + agreement)^b. The numbers a = _LEAST_AGREEMENT and b = _AGREEMENT_POWER were chosen empirically.
 _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
@@ -90,15 +90,15 @@ class Search:
         plan: options of the search.
         problem: problems whose points are centred at the origin, because the search computes in float32.
         thresholds: thresholds of an inlier.
-        chances: relative probabilities that pairs are inliers, shape :math:`(B, N)`; ``None``: equal probabilities.
-        sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`. ``None``: the search estimates
-            it from the residuals of the inliers.
+        chances: relative probabilities that pairs are inliers, shape :math:`(B, N)`, or ``None`` if they are equal.
+        sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`. If ``None``, the search
+            estimates the standard deviation from the residuals of the inliers.
         finds_rivals: whether the search finds ``rivals``.
 
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
-        rivals: the pose with the least loss at a quarter of the thresholds, before any improvement, :math:`(B, 12)`.
+        rivals: the unimproved pose with the least loss at a quarter of the thresholds, shape :math:`(B, 12)`.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Search:
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, self.thresholds, _DTYPE)
-        # The numbers of a pair are adjacent, so that one operation selects pairs: (B, N, 6), or (B, N, 18) for rigs.
+        # All numbers of a pair are adjacent, (B, N, 6) or (B, N, 18) for rigs, so that one operation selects pairs.
         rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
         self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
         self.low = self.pairs.to(_DTYPE)
@@ -148,7 +148,7 @@ class Search:
                 number of samples.
 
         Returns:
-            The indices in the batch of the problems from which samples were drawn.
+            The indices, in the batch, of the problems from which samples were drawn.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -184,7 +184,7 @@ class Search:
 
         Args:
             positions: for each sample, the positions of its pairs in the problem, shape :math:`(B, H, s)`.
-            judges: positions of the pairs that score all poses, shape :math:`(B, J)`; negative positions are ignored.
+            judges: positions of the pairs that score all poses, shape :math:`(B, J)`. Negative positions are ignored.
         """
         problems = torch.arange(positions.shape[0], device=positions.device)
         poses, valid = self._solved(problems, positions)
@@ -221,7 +221,7 @@ class Search:
         return Samples(chances, size=self.minimal.sample_size, most=self.plan.max_samples, seed=self.plan.seed)
 
     def _prefer_agreement(self, problems: Tensor) -> None:
-        """Multiply the chances of the pairs of some problems by the agreement of their neighbours."""
+        """In some problems, multiply the chance of each pair by (a + agreement)^b, see `_PLAIN_SAMPLES`."""
         world, img, weights = take(self.problem[:3], problems)
         agreement = agreement_of_neighbours(world, img, weights > 0)
         chances = self.chances.clone()
@@ -232,7 +232,7 @@ class Search:
         """Estimate how many samples some problems need, from the inliers of their best poses.
 
         After `_prefer_agreement`, the estimate is the geometric mean of the numbers for the old and the new chances. If
-        structure repeats, neighbours of outliers agree too. The number for the new chances could end a search early.
+        structure repeats, neighbours of outliers agree too. The new number alone could end a search too early.
         """
         if not len(at):
             return
@@ -251,7 +251,7 @@ class Search:
         self.needed[at] = needed
 
     def _sizes_of_round(self, done: int) -> tuple[int, int]:
-        """Number of samples in the next round, and largest number of remaining samples that are drawn in one round."""
+        """Number of samples in the next round, and the largest number of remaining samples that one round draws."""
         size = min(max(self.plan.min_samples, int(_GROWTH * done)), _LARGEST_ROUND)
         most = max(_ROUNDS_LEFT * size, _FEW_SAMPLES if self.problem.free_focal is None else 0)
         return size, min(most, _LARGEST_ROUND)
@@ -265,13 +265,13 @@ class Search:
         self._expect(problems[better & (self.samples.totals[problems] > stop)])
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
-        """Find the best poses of the samples ``start`` to ``stop - 1``: ascending losses (P, K), and poses (P, 12, K).
+        """Ascending losses (P, K) and entries (P, 12, K) of the best poses of the samples ``start`` to ``stop - 1``.
 
         If a problem has many pairs, a few pairs score all poses first. More pairs then score the best poses. The number
-        of first pairs increases with ``start``, because inliers are rare if many samples had no success.
+        of pairs in the first scoring grows with ``start``, because inliers are rare if many samples had no success.
         """
         poses, valid = self._solved(problems, self.samples.positions(problems, start, stop))
-        # After its last sample, a problem repeats samples. Its best poses must not depend on the rest of the batch.
+        # Repeated samples of a problem are invalid, so that its best poses do not depend on the rest of the batch.
         fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]
         valid = valid & fresh.repeat(1, valid.shape[1] // (stop - start))
         if valid.shape[1] * self.low.shape[1] > _FEW_RESIDUALS:
@@ -286,7 +286,7 @@ class Search:
         return self._compared(problems, scene, poses, valid)
 
     def _solved(self, problems: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Solve samples (P, H, s) of some problems: poses (P, 12, S H), and which poses are solutions, (P, S H)."""
+        """Solve samples (P, H, s) of some problems. Returns poses (P, 12, S H), and which are solutions, (P, S H)."""
         each = positions.shape[:2]
         rows = full_vectors((positions + problems[:, None, None] * self.pairs.shape[1]).flatten(0, 1))  # (R, s)
         values = self.pairs.flatten(0, 1).index_select(0, rows.flatten()).unflatten(0, rows.shape)
@@ -299,7 +299,7 @@ class Search:
         return poses.movedim(2, 0).flatten(2), valid.movedim(1, 0).flatten(1)
 
     def _compared(self, problems: Tensor, scene: Scene, poses: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Select the best of poses (P, 12, W): ascending losses (P, K), and poses (P, 12, K). Store better rivals."""
+        """Ascending losses (P, K) and entries (P, 12, K) of the best of poses (P, 12, W). Better rivals are stored."""
         if self.finds_rivals:
             loss, rival, _ = self._best_of(scene, poses, valid, 1, narrower=_NARROWER)
             better = loss[:, 0] < self.rival_loss[problems]
@@ -310,7 +310,7 @@ class Search:
     def _best_of(
         self, judges: Scene, poses: Tensor, valid: Tensor, width: int, narrower: float = 1.0
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Select the K poses with the smallest losses: ascending losses (P, K), poses (P, 12, K), validity (P, K)."""
+        """Ascending losses (P, K), entries (P, 12, K) and validity (P, K) of the K poses with the smallest losses."""
         losses = judges.losses(poses, self.plan.score, narrower).masked_fill(~valid, torch.inf)
         losses, order = losses.topk(min(width, losses.shape[1]), largest=False)
         return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
@@ -348,8 +348,8 @@ class Search:
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
     """Take one least-squares step. Pairs are weighted by the products of ``weights`` (B, N) and ``problem.weights``.
 
-    If the focal length has a prior, ``variance`` (B, 1) is the variance of a pixel coordinate. It determines the
-    relative weight of the prior. The default is one squared pixel of the caller's image.
+    If the focal length has a prior, the weight of the prior depends on ``variance`` (B, 1), the variance of a pixel
+    coordinate. By default, this variance is one squared pixel of the caller's image.
     """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
@@ -370,8 +370,7 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
     """Repeat the first row until the number of rows is a multiple of `_VECTOR`, unless each row has many pairs.
 
-    Processors round differently in partly filled vectors. Without the repeated rows, results would depend on the
-    position in the batch.
+    Processors round differently in partly filled vectors, so that results would depend on the position in the batch.
     """
     if compiling() or pairs > _VECTOR:
         return rows

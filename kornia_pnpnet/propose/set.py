@@ -28,44 +28,43 @@ __all__ = ["SetInit"]
 
 _T = TypeVar("_T")
 
-# Number of features of a pair, without confidences and repeats, see `_View`.
+# Number of features of a pair, see `_View`. Confidences and repeats add further features.
 _FEATURES = 14
-# Ridge, divided by the mean square of the world points. The ridge makes the affine camera of planar points unique.
+# Ridge of the affine fit, divided by the mean square of the points. The ridge makes the fit to planar points unique.
 _RIDGE = 0.02
 # Features are clipped to this absolute value, so that no pair dominates the network.
 _MOST = 8.0
 # Confidences are clipped to at least this distance from 0 and from 1.
 _LEAST_CONFIDENCE = 1e-3
-# Logarithm of the noise at the centre of its range. The unit of noise is the spread of the pixels or world points.
+# Centre of the range of log(noise) that the network can estimate. The unit is the spread of the pixels or world points.
 _LOG_NOISE = -5.0
-# Least noise, as a share of the spread. Scores divide by the variance, which must not be 0.
+# Least noise, divided by the spread. Scores divide by the variance of the noise, which must not be 0.
 _LEAST_NOISE = 1e-6
-# The softmax is computed over rows of at least this number of pairs. PyTorch 2.13 is slow for shorter rows.
+# Least number of pairs for which the softmax is computed over rows. PyTorch 2.13 is slow for shorter rows.
 _SHORT = 16
 # This number is added to the attention score of padding.
 _ABSENT = -1e9
-# Minimal samples. Each number is the rank of a pair in descending order of likelihood. The first six samples are a
-# Turán system: if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
+# Minimal samples, as ranks of the pairs in descending order of likelihood. The first six samples are a Turán system:
+# if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# Each entry is a number of pairs and a factor. In problems with at least this number of pairs, the samples above are
-# used twice: as they are, and with all ranks multiplied by the factor. The second use helps if the likeliest pairs
-# agree on an incorrect pose.
+# For each entry (n, f), problems of at least n pairs also use the samples above with all ranks multiplied by f. If the
+# likeliest pairs agree on an incorrect pose, the samples of larger ranks help.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
-# Problems with at least 36 pairs have 25 further samples of the 25 likeliest pairs. No two samples share two pairs.
+# 25 further samples of the 25 likeliest pairs, for problems of at least 36 pairs. No two of the 25 share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
 # Number of likeliest pairs that score each hypothesis.
 _MOST_JUDGES = 32
-# At this squared residual, divided by the variance, the score of a pair is half the score at the residual 0.
+# If the squared residual of a pair is this number times the variance, the score is half the score at the residual 0.
 _JUDGED = 50.0
 # Score of a pair of likelihood 0, divided by the score of a pair of likelihood 1.
 _LEAST_VOTE = 0.5
-# If the minimal samples have more slots than this number, empty slots are removed before scoring (CPU only).
+# If the minimal samples have more slots for poses than this number, a CPU removes the empty slots before scoring.
 _MANY_SLOTS = 64
-# Least depth, in normalised units, at which the noise of points is converted to pixels.
+# The noise of points is converted to pixels at the depth of a pose, but at least at this depth (normalised units).
 _LEAST_DEPTH = 0.5
-# If a search follows, the network sees at most this number of pairs, but the search uses all pairs. With 32 to 96
-# pairs, the success is the same as with all pairs, on real matches and on random problems of up to 1000 pairs.
+# If `search_on` follows, the network sees at most this number of pairs, but the search uses all pairs. On real matches
+# and on random problems of up to 1000 pairs, limits of 32 to 96 pairs give the same success rate as no limit.
 _ENOUGH = 48
 
 
@@ -74,13 +73,13 @@ class _View:
 
     The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll. The
     camera is rotated to the mean ray, and zoomed so that the spread of the rays is 1. Ridge regression fits an affine
-    camera to the pairs, and the world is rotated to its axes.
+    camera to the pairs, and the world is rotated to the axes of this affine camera.
 
     Attributes:
         there: 1 for usual pairs (see ``Problem.usual``) with a weight above 0, else 0, shape :math:`(B, N)`.
         rays: unit rays in the frame of the original camera, shape :math:`(B, N, 3)`.
-        log_spread: logarithm of the spread of the rays, shape :math:`(B, 1)`. The spread is the root mean square sine
-            of the angles between the rays and the mean ray.
+        log_spread: logarithm of the spread of the rays, shape :math:`(B, 1)`. The spread is the root mean square of
+            :math:`\sin \alpha`, where :math:`\alpha` is the angle between a ray and the mean ray.
         unit: spread of the pixels, and spread of the world points, shape :math:`(B, 2)`.
         height: third coordinates of the rotated world points, shape :math:`(B, N)`.
         features: the network's input, shape :math:`(B, N, C)`.
@@ -94,7 +93,7 @@ class _View:
         plane = functional.pad(problem.img_points / problem.focal, (0, 1), value=1.0)
         self.rays = functional.normalize(plane, dim=-1)
         mean = functional.normalize((share * self.rays).sum(1), dim=-1)
-        # Two reflections rotate the mean ray to the z axis: one maps it to the negative z axis, the other negates z.
+        # Two reflections rotate the mean ray to the z axis: one maps the ray to the negative z axis, one negates z.
         half = mean + eye[2]
         mirror = 1.0 - 2.0 * eye[2]
         turn = (half * mirror)[..., None] * (half / half[:, 2:])[:, None]
@@ -122,12 +121,12 @@ class _View:
         self.features = torch.cat(parts, -1).clamp(-_MOST, _MOST)
 
     def _noise(self, problem: Problem) -> Tensor:
-        """Logarithms of noise over spread, for pixels and for points, and whether the noise is known, (B, N, 4)."""
+        """Features (B, N, 4): log(noise / spread) of pixels and of points, then whether each noise is known."""
         if problem.noise is None:
             return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
         known = sigmas.isfinite()
-        # Unknown sigmas are NaN. They are replaced before the division, because `unit` would get the gradient NaN.
+        # Unknown sigmas are NaN, and are replaced before the division, because `unit` would get the gradient NaN.
         relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
         logs = torch.where(known, relative.clamp(min=_LEAST_NOISE).log() - _LOG_NOISE, 0.0)
         return torch.cat((logs, known.to(logs.dtype)), -1)
@@ -135,17 +134,17 @@ class _View:
 
 @torch.no_grad()
 def _repeats(problem: Problem) -> Tensor:
-    """Logarithms (B, N, 2) of the numbers of pairs that share a pair's pixel, and of those that share its point."""
+    """Logarithms (B, N, 2) of two counts: the pairs that share the pixel of a pair, and those that share its point."""
     there = problem.usual_weights > 0
     return torch.stack([copies(x, there) for x in (problem.img_points, problem.world_points)], -1).log()
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:
-    """The rotation with first rows closest to ``affine`` (B, 2, 3), whose squared row lengths are ``squares``."""
+    """Rotation with first two rows closest to ``affine`` (B, 2, 3). Squared row lengths of affine are ``squares``."""
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
-    # The closest orthonormal rows are S^-1/2 times the rows, where S is the Gram matrix of the rows. S^-1/2 is
-    # proportional to the adjugate of S + sqrt(det S) I.
+    # The orthonormal rows closest to A = `affine` are S^-1/2 A, where S = A A^T. S^-1/2 is proportional to the adjugate
+    # of S + sqrt(det S) I.
     raised = squares + (1e-3 * squares.sum(-1, keepdim=True) + 1e-6)
     first, second = raised.split(1, -1)  # the gradient of `prod` would synchronise a GPU
     root = (first * second - product.square()).clamp(min=1e-12).sqrt()
@@ -161,7 +160,7 @@ def _frame(affine: Tensor, squares: Tensor) -> Tensor:
 
 
 def _taken(tree: _T, index: Tensor) -> _T:
-    """Select the pairs at positions (B, K) in each tensor (B, N, ...) of pairs. Other tensors do not change."""
+    """Select pairs by positions (B, K) in each tensor (B, N, ...) of pairs. Tensors without pairs do not change."""
 
     def take(x: Tensor) -> Tensor:
         of_pairs = x.ndim > 1 and x.shape[1] > index.shape[1]
@@ -180,13 +179,13 @@ def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
 
 
 def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
-    """Variance of the pixels (B, N) from the noise of pixels and points, at the depth of the world's centre."""
+    """Variance (B, N) of the pixels, from the noise of pixels and of points at the depth of the world's centre."""
     depth = pose.translation[:, 2:].clamp(min=_LEAST_DEPTH)
     return noise.img.square() + (focal * noise.world / depth).square()
 
 
 def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
-    """The number of pairs that a problem needs to use each of S samples, and the 3 S ranks of the samples' pairs."""
+    """How many pairs a problem needs to use each of S samples, and the 3 S ranks of the pairs of all samples."""
     every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if not search_follows:  # a search draws further samples
         every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
@@ -197,10 +196,7 @@ def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[in
 
 @cache
 def _sample_table(count: int, number: int, search_follows: bool, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Ranks (3 S,) and numbers of pairs (S, 1) of :func:`_samples`, copied to a device only once.
-
-    A CUDA graph cannot contain a copy from the CPU.
-    """
+    """Ranks (3 S,) and numbers of pairs (S, 1) of `_samples`, copied once. A CUDA graph cannot copy from the CPU."""
     least, ranks = _samples(count, number, search_follows)
     with torch.inference_mode(False):  # later calls may need gradients
         return torch.tensor(ranks, device=device), torch.tensor(least, device=device)[:, None]
@@ -221,7 +217,7 @@ def _support(poses: Tensor, judges: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """A residual layer. Its inputs are the features of a pair, and a context that attention pools over all pairs."""
+    """A residual layer of two inputs: the features of a pair, and a context that attention pools over all pairs."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -236,7 +232,7 @@ class _Block(nn.Module):
             self.out.bias.zero_()
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
-        """Map ``x`` (B * N, width) to the same shape. ``absent`` (B, N) is ``_ABSENT`` for padding, else 0."""
+        """Map ``x`` (B * N, width) to a tensor of this shape. ``absent`` (B, N) is ``_ABSENT`` for padding, else 0."""
         (batch, count), width, heads = absent.shape, x.shape[1], self.heads
         y = self.norm(x)
         values, scores = self.look.weight.split((width, heads))
@@ -252,9 +248,9 @@ class _Block(nn.Module):
 
 
 def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
-    """Softmax (C, B, N), over the pairs, of C scores that are linear in ``x`` (B * N, width).
+    """Softmax over the pairs, (C, B, N). The C scores of a pair are linear in ``x`` (B * N, width).
 
-    For few pairs, the softmax is computed over columns. Columns take a tenth of the time of short rows.
+    For few pairs, the softmax is computed over columns, in a tenth of the time of the softmax over rows.
     """
     scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(weight.shape[0], *absent.shape)
     if compiling() or scores.shape[-1] >= _SHORT or are_few(scores):
@@ -267,15 +263,15 @@ class SetInit(Initialiser):
 
     In every residual layer, attention pools a context over all pairs. The cost is linear in the number of pairs, and
     the order of the pairs has no effect. For each hypothesis, the network predicts a weight of each point, and the
-    distance of each point from the camera. The pose is the rigid motion that aligns the world points with the points at
-    these distances. Poses are equivariant to similarity transforms of the world, and to rotations of the camera except
-    the roll.
+    distance of each point from the camera. The pose is the rigid motion that aligns the world points with the points on
+    the rays at the predicted distances. Poses are equivariant to similarity transforms of the world, and to rotations
+    of the camera except the roll.
 
     The likeliest pairs also form minimal samples of three (see :func:`~kornia_pnpnet.propose.p3p.p3p`), and score the
-    poses of the samples. The best pose is a further hypothesis, and has no gradient.
+    poses of the samples. The best pose of the samples is a further hypothesis, and has no gradient.
 
     The weight of a pair is the estimated probability that the pair is an inlier. The network also estimates unknown
-    noise. The layers compute in the dtype of the network's weights, all other operations in the dtype of the pairs.
+    noise. The layers compute in the dtype of the network's weights, and other operations in the dtype of the pairs.
 
     Sources: J. Hesch and S. Roumeliotis, "A direct least-squares method for PnP", ICCV 2011 (distances along rays, then
     alignment); W. Sun et al., "ACNe: Attentive context normalization for robust permutation-equivariant learning", CVPR
@@ -329,7 +325,7 @@ class SetInit(Initialiser):
         self.first = nn.Linear(_FEATURES + 2 * confidence + 2 * repeats, width)
         self.blocks = nn.ModuleList(_Block(width, heads, hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        # Outputs of a pair: the logit of being an inlier, a weight per hypothesis, and a distance per hypothesis.
+        # Outputs of a pair: the inlier logit, a weight per hypothesis, and a distance per hypothesis.
         self.pair = nn.Linear(width, 1 + 2 * starts)
         # Outputs of a problem: the distance of the world's centre per hypothesis, and the noise of pixels and points.
         self.problem = nn.Linear(width, starts + 2)
@@ -366,8 +362,8 @@ class SetInit(Initialiser):
         probability = torch.sigmoid(of_pairs[0])
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
         away, noise = of_problem.split((starts, 2), -1)
-        # The distance of a point is approximately the distance of the world's centre plus an offset. With a factor
-        # instead of the offset, the relief of the points would grow with the distance.
+        # The distance of a point is approximately the distance of the world's centre plus an offset. If the network
+        # predicted a factor instead of an offset, the relief of the points would grow with the distance.
         distance = (away.clamp(-6.0, 6.0) - view.log_spread).exp().mT[..., None]  # (S, B, 1)
         relief = torch.add(view.height, along, alpha=3.0) / distance
         ranges = distance * relief.clamp(-3.0, 3.0).exp()
@@ -387,7 +383,7 @@ class SetInit(Initialiser):
 
     @torch.no_grad()
     def _sampled(self, problem: Problem, chances: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
-        """The pose with the best score of all minimal samples, or ``fallback`` if no sample has a valid pose."""
+        """The pose with the best score of all poses of the samples, or ``fallback`` if no sample has a valid pose."""
         batch, count = chances.shape
         there = problem.usual_weights > 0
         # Unlikely pairs also contribute to scores, because they can be inliers.

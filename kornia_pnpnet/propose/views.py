@@ -45,7 +45,7 @@ def from_views(init: Callable[[Problem], Starts], problem: Problem, count: int, 
 
 
 def _views(problem: Problem, count: int, order: bool) -> Problem:
-    """The first views of all problems, then the second views, and so on. Covariances and terms are left out."""
+    """Concatenate the first views of all problems, the second views, and so on. Drop covariances and terms."""
     noise = None if problem.noise is None else problem.noise.sigmas
     of_pairs = problem.weights, problem.usual, noise, problem.confidence
     others = [values.mT for values in iter_tensors(of_pairs)]  # (N, B) each

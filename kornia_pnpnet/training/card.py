@@ -1,4 +1,4 @@
-"""The model card of trained weights: a short template, filled with the results of the run that trained the weights."""
+"""The model card of trained weights: a short template that is filled with the results of the training run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kornia_pnpnet.training.results import RunResults
 __all__ = ["HOW_IT_RAN", "write_model_card"]
 
 _TAGS = ["camera-pose-estimation", "kornia", "perspective-n-point", "pnp"]
-#: Overrides that do not change the results of a run.
+#: Overrides of ``train.py`` that do not change the results of a run.
 HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
 # Matches absolute paths, but not the slashes of a URL or of a relative path.
 _PATH = re.compile(r"(?:file://|(?<![\w./\\])(?:~|[A-Za-z]:)?)(?:/(?!/)|\\)[^\s,;'\"\]})]*")
@@ -48,7 +48,7 @@ A success has a rotation error below 1° and a translation error below 0.2. Inte
 def write_model_card(folder: str | Path, results: RunResults, *, name: str | None = None) -> None:
     """Write ``README.md`` into the folder of weights, with metadata for the Hugging Face Hub.
 
-    ``results`` describe the run that trained the weights. By default, the weights have the name of the run.
+    ``results`` are the results of the run that trained the weights. The default ``name`` is the name of this run.
     """
     from huggingface_hub import EvalResult, ModelCardData
 
@@ -68,7 +68,7 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
 
 
 def _describe(results: RunResults) -> str:
-    """Describe a run in one line. In the command of the run, ``PATH`` replaces absolute paths."""
+    """Describe a run in one line that contains its command. ``PATH`` replaces the absolute paths of the command."""
     words = ["python train.py"]
     for override in results.overrides:
         key, _, value = override.partition("=")

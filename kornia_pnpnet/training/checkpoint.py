@@ -1,4 +1,4 @@
-"""Stopping, continuing and watching a run: signals, checkpoints, learning curves and times of stages."""
+"""Stopping, continuing and monitoring a run: signals, checkpoints, learning curves, and the time of each stage."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TrainingError(RuntimeError):
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Turn the first SIGTERM or Ctrl-C into an event, so that the loop can save a checkpoint before it ends.
+    """Turn the first SIGTERM or Ctrl-C into an event, so that the training loop can save a checkpoint before the end.
 
     Only the main thread can catch signals. In other threads the event is never set.
     """
@@ -66,7 +66,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, An
 
 
 class History:
-    """Learning curves in a CSV file and TensorBoard. Rows of earlier calls stay if ``update <= start``."""
+    """Learning curves in a CSV file and in TensorBoard. Rows of earlier calls are removed if ``update > start``."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
         self._path, self._columns = folder / HISTORY_NAME, columns
@@ -90,7 +90,7 @@ class History:
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Raise ``TrainingError`` if the file is damaged or its identity differs. The file's ``updates`` may be smaller.
+    Raise ``TrainingError`` if the file is damaged or has another identity. Only the file's ``updates`` may be smaller.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)

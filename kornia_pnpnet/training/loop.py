@@ -1,7 +1,7 @@
 """The training loop on one process or several. Lightning Fabric handles devices and processes.
 
-The loop raises the weight of the loss terms of refined poses from 0 to 1, and skips steps whose loss or gradient is not
-finite. A run that is stopped and continued gives the same numbers as a run without a stop.
+During a run, the weight of the loss terms of refined poses rises from 0 to 1. Steps whose loss or gradient is not
+finite are skipped. A run that is stopped and continued gives the same numbers as a run without a stop.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ __all__ = ["TrainSettings", "fit", "train_briefly"]
 
 _log = logging.getLogger(__name__)
 
-# Stages of an update. "rest" consists of learning curves, validations and checkpoints.
+# Stages of an update. The stage "rest" consists of learning curves, validations and checkpoints.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
 _REFINES = "with refinement"  # label of the progress bar
-# Columns of the learning curves, except the columns of validations.
+# Columns of the learning curves, without the columns of validations.
 _COLUMNS = ["update", *LossTerms._fields, "ramp", "lr", "grad_norm", "skipped", "updates_per_second"]
 _COLUMNS += [*(f"{stage}_share" for stage in _STAGES), "peak_memory_mib"]
-# Columns of a validation without the prefix ``val/<set>/``, and the attribute of ValidationResult in each column.
+# Maps each column of a validation, without its prefix ``val/<set>/``, to an attribute of ValidationResult.
 _CURVES = {
     "success": "success.rate",
     "rotation_error_deg": "median_rotation_error_deg",
@@ -77,7 +77,7 @@ class TrainSettings:
         lr_refine: Adam's learning rate for the hyperparameters of the refinement.
         warmup: number of updates over which the learning rates rise linearly.
         final_lr: factor that multiplies the learning rates at the end of the cosine decay. 1 means no decay.
-        clip: largest norm of a gradient. Longer gradients are scaled to this norm; infinity means no clipping.
+        clip: largest norm of a gradient. Longer gradients are scaled to this norm. Infinity means no clipping.
         ramp: start and end of the ramp, as shares of the run. During the ramp, the weight of the loss terms of refined
             poses rises linearly from 0 to 1.
         max_skipped: largest number of skipped steps. A larger number ends the run with an error.
@@ -111,12 +111,12 @@ class TrainSettings:
         KORNIA_CHECK(rises, f"ramp must be two shares, the second not smaller, got {self.ramp}.")
 
     def lr_factor(self, update: int) -> float:
-        """Factor of the learning rates at an update: a linear warm-up times a cosine from 1 to ``final_lr``."""
+        """Factor that multiplies the learning rates: a linear warm-up times a cosine from 1 to ``final_lr``."""
         cosine = 0.5 * (1.0 + math.cos(math.pi * min(1.0, update / max(1, self.updates))))
         return min(1.0, (update + 1) / max(1, self.warmup)) * (self.final_lr + (1.0 - self.final_lr) * cosine)
 
     def ramp_factor(self, update: int) -> float:
-        """Weight of the refined loss terms at an update, 0 to 1."""
+        """Weight of the loss terms of refined poses at an update, from 0 to 1."""
         start, end = (share * self.updates for share in self.ramp)
         return 0.0 if update < start else 1.0 if update >= end else (update - start) / (end - start)
 
@@ -142,23 +142,23 @@ def fit(
 
     Args:
         model: the solver, trained in place.
-        data: source of the problems. Batch ``i`` is the batch of update ``i + 1``.
+        data: source of the problems. Update ``i + 1`` uses batch ``i``.
         validation: problems of the validation sets, by the name of the set.
         loss: loss that compares results with true poses.
         settings: numerical settings of the run.
         folder: folder of the run.
-        fabric: a launched Fabric. ``None`` means one process on the CPU.
+        fabric: a launched Lightning Fabric. ``None`` means one process on the CPU.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
-            only with an equal ``identity`` and equal settings, except that ``settings.updates`` may grow. The learning
-            rates and the ramp then follow the schedule of the longer run.
-        data_workers: number of processes that draw the next batches, for each training process.
+            only with the same ``identity`` and the same settings. Only ``settings.updates`` may grow. If it grows, the
+            learning rates and the ramp follow the schedule of the longer run.
+        data_workers: number of processes per training process that draw the next batches.
         resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
 
     Raises:
-        TrainingError: when ``folder`` holds a checkpoint and ``resume`` is false; when the checkpoint is damaged, or
-            its settings, solver options or ``identity`` differ; or when more than ``settings.max_skipped`` steps were
-            skipped.
+        TrainingError: when ``folder`` holds a checkpoint but ``resume`` is false; when the checkpoint is damaged, or
+            its settings, solver options or ``identity`` differ from those of this call; or when more than
+            ``settings.max_skipped`` steps were skipped.
         BaseError: when the batch size is not a multiple of the number of processes.
     """
     fabric = fabric or Fabric(accelerator="cpu", devices=1)
@@ -198,7 +198,7 @@ def fit(
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
     part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
-    # Updates with refinement are much slower than updates before. Each of these phases has its own bar and speed.
+    # Updates with refinement are much slower than earlier updates, so the progress bar restarts with the refinement.
     alone = min(settings.updates, math.ceil(settings.ramp[0] * settings.updates))
     phase = ("network alone", alone) if start < alone else (_REFINES, settings.updates)
     bar = tqdm(None, *phase, initial=start, disable=not progress or history is None, unit="update", smoothing=0.0)
@@ -207,7 +207,7 @@ def fit(
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
 
     def report(since: int, before: Mapping[str, float]) -> FitReport:
-        """Report the work since the update ``since``, at which the clock had the seconds ``before``."""
+        """Report the work after the update ``since``. ``before`` holds the seconds of the clock at that update."""
         clock.lap("rest")
         spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
         whole = sum(spent.values())
@@ -236,8 +236,8 @@ def fit(
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
             terms = _compare(solver, loss, problems, ramp)
-            # Before the ramp, the loss gets a zero term with the refiner's parameters, because training on several
-            # processes needs a gradient of every parameter.
+            # Before the ramp, the loss gets a zero term with the parameters of the refinement, because training on
+            # several processes needs a gradient of every parameter.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")
             optimizer.zero_grad()
@@ -304,7 +304,6 @@ def fit(
 
 
 def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: float) -> LossTerms:
-    """Solve the problems and compute the loss of the results."""
     options = {**problems.known, "first_stage_only": ramp == 0.0}
     if isinstance(loss, SetLoss):
         result, guess = solver.with_starts(*problems[:3], **options)
@@ -313,7 +312,7 @@ def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: fl
 
 
 def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) -> Path:
-    """Train a new PnP-Net for n = 9 for about ``seconds``, and return the path of the learning curves (CSV).
+    """Train a new PnP-Net for 9 pairs for about ``seconds``, and return the path of the learning curves (CSV).
 
     The number of updates follows from a short measurement of the machine's speed. An earlier run in ``folder`` is
     replaced. Raise ``BaseError`` when ``seconds`` is not a positive number.

@@ -36,8 +36,8 @@ __all__ = [
 ]
 
 RESULTS_NAME = "results.json"
-# Problems per timed call, and number of timed calls. The shortest time is reported, because other work on the machine
-# can only make a call slower.
+# Number of problems in a timed call, and number of timed calls. The shortest time is reported, because other work on
+# the machine can only make a call slower.
 _TIMED_PROBLEMS, _TIMED_CALLS = 1000, 10
 
 
@@ -49,12 +49,12 @@ class FitReport:
         start: number of updates in earlier calls.
         update: number of updates in earlier calls and this call.
         skipped: number of skipped steps in earlier calls and this call. See :func:`~kornia_pnpnet.training.fit`.
-        interrupted: whether a signal ended the call early. A checkpoint is then saved.
+        interrupted: whether a signal ended the call early. In this case, the call saved a checkpoint.
         seconds: wall-clock time of this call.
         updates_per_second: average speed of this call.
-        time_shares: share of ``seconds`` for each stage: data (waiting for it), forward, backward, optimizer and rest.
+        time_shares: share of ``seconds`` per stage: data (waiting for data), forward, backward, optimizer and rest.
         peak_memory_mib: on a GPU, the peak memory that PyTorch allocated. Otherwise the peak resident memory of this
-            process, which is 0 on Windows.
+            process, which is reported as 0 on Windows.
     """
 
     start: Count
@@ -96,7 +96,7 @@ class Learned(NamedTuple):
     robustness: list[float]
 
 
-# The keys that readers need. The mappings can have further keys.
+# Each mapping declares the keys that this package reads. Other keys are allowed.
 _Init = TypedDict("_Init", {"name": str})
 _Refine = TypedDict("_Refine", {"m": Count})
 _Size = TypedDict("_Size", {"n": Count})
@@ -157,13 +157,13 @@ class RunResults:
         return str(self.config.get("name") or self.initializer or "PnPNet")
 
     def lineage(self) -> list[RunResults]:
-        """The runs that trained these weights, in order. The last entry is this run."""
+        """The runs that trained the weights of this run, in order. The last entry is this run."""
         return [*(self.origin.lineage() if self.origin else ()), self]
 
 
 @torch.no_grad()
 def validate(model: nn.Module, validation: Mapping[str, Problems]) -> dict[str, ValidationResult]:
-    """Solve the problems of each validation set and summarise the errors by the name of the set."""
+    """Solve the problems of each validation set, and map the name of the set to a summary of the errors."""
     results = {}
     for name, problems in validation.items():
         result = model(*problems[:3], **problems.known)
@@ -215,18 +215,18 @@ def load_run(path: str | Path) -> RunResults:
 def find_results(weights: str | Path) -> RunResults | None:
     """Load the results of the run that trained some weights, or return ``None`` if there is no results file.
 
-    The file is in the folder of the weights, or in the parent folder if the folder has the name ``weights``. For the
-    argument and the errors see :func:`~kornia_pnpnet.pretrained.find_weights` and :func:`load_run`.
+    The file is in the folder of the weights. If this folder is named ``weights``, its parent folder is searched, too.
+    For the argument and the errors see :func:`~kornia_pnpnet.pretrained.find_weights` and :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Results beside another folder can be unrelated.
+    # `train.py` writes weights into the folder `weights` of a run. Beside any other folder, results can be unrelated.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)
 
 
 def summarize_runs(folder: str | Path) -> Path | None:
-    """Write ``summary.csv`` with one row for each run in a sub-folder of ``folder``: overrides, speed and success.
+    """Write ``summary.csv``: one row with overrides, speed and success for each run in a sub-folder of ``folder``.
 
     A results file that cannot be read is left out with a warning.
 
@@ -235,7 +235,7 @@ def summarize_runs(folder: str | Path) -> Path | None:
     """
     folder = Path(folder)
     rows: list[dict[str, Any]] = []
-    overrides: dict[str, None] = {"run": None}  # the first columns
+    overrides: dict[str, None] = {"run": None}  # the first columns of the summary
     for path in sorted(folder.glob(f"**/{RESULTS_NAME}")):
         try:
             results = load_run(path)

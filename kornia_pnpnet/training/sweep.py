@@ -1,4 +1,4 @@
-"""The table at the end of a sweep of ``train.py``."""
+"""A Hydra callback that prints a table at the end of a sweep of ``train.py``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.training.card import HOW_IT_RAN
 
-# In a summary, the columns of the overrides precede this column.
+# The first column of a summary after the columns of the overrides.
 _FIRST_RESULT = "update"
 
 
 class SweepTable(Callback):
-    """When all runs have ended, print the overrides that differ between them, and the speed and success of each run."""
+    """At the end of a sweep, print each run's speed, success, and those overrides that differ between the runs."""
 
     def on_multirun_end(self, config: Any, **_: Any) -> None:
         """Print the table, and the path of the summary that the runs have written into the sweep's folder."""
