@@ -163,7 +163,7 @@ def bearings(
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
-    """Raise an error when both arguments are given, or when no lens model has the number of coefficients."""
+    """Raise an error when both arguments are given, or when no lens model has as many coefficients as given."""
     check_tensors({"dist": dist, "fisheye": fisheye})
     if dist is not None and fisheye is not None:
         raise ValueCheckError("Give dist or fisheye, not both.")

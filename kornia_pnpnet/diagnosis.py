@@ -28,7 +28,7 @@ _EQUAL = 0.5
 class Trial(NamedTuple):
     """Agreement of the pairs with the best pose after one change of the input. Numbers are medians over the batch."""
 
-    change: str  #: The change in words.
+    change: str  #: Description of the change.
     evidence: float  #: Evidence for the pose, divided by the number of pairs, see :mod:`kornia_pnpnet.judge.evidence`.
     agree: float  #: Share of the pairs that are inliers.
     sigma: float  #: Standard deviation of a pixel coordinate, estimated from the inliers, in pixels.

@@ -242,7 +242,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
         threshold: largest reprojection error, in pixels, of an inlier.
         iterations: largest number of RANSAC iterations.
         confidence: RANSAC stops when a sample without outliers was drawn with at least this probability, in (0, 1).
-        method: OpenCV's name of the solver of minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
+        method: the solver for minimal samples, by OpenCV's name, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
         refine: whether to refine RANSAC's pose by least squares of the inliers' reprojection errors. The field ``init``
             of the result is the pose before this refinement.
         seed: seed of OpenCV's global random numbers, set before each problem.
@@ -301,7 +301,7 @@ class KorniaRs(RobustPeer):
 
     Args:
         max_iterations: largest number of RANSAC iterations.
-        method: kornia-rs's name of the solver of minimal samples, ``"AP3P"`` or ``"EPnP"``.
+        method: the solver for minimal samples, by kornia-rs's name: ``"AP3P"`` or ``"EPnP"``.
     """
 
     threshold: float = 40.0

@@ -74,7 +74,7 @@ class Noise(NamedTuple):
 
     @property
     def sigmas(self) -> Noise:
-        """The noise without covariances."""
+        """A copy whose covariances are ``None``."""
         return self._replace(img_cov=None, world_cov=None)
 
     @property

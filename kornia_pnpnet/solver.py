@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -13,8 +14,8 @@ from torch import Tensor, nn
 from kornia_pnpnet.arguments import checked_inputs, given_cameras, in_parts, restore_leading
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
-from kornia_pnpnet.core.performance import Runner, in_full_precision, in_turn, sees_values
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.performance import Runner, in_full_precision, in_turn, needs_graph, sees_values
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.core.watch import GradientWatch
 from kornia_pnpnet.frame import Frame, Normalize
 from kornia_pnpnet.pretrained import PretrainedMixin
@@ -267,14 +268,18 @@ class PnPNet(PretrainedMixin):
                 "`cam_from_rig` and bearings as `img_points` need an initialiser or `init`, and exclude `alternatives`."
             )
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
-        with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points):
-            compiled = self._run.compiled or self._whole.compiled
+        compiled = self._run.compiled or self._whole.compiled
+        plain = not (compiled or needs_graph((*iter_tensors(inputs), *self.parameters())))
+        inference = torch.inference_mode() if plain else nullcontext()
+        with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points), inference:
             single = compiled and len(inputs.world_points) == 1 and not (self._run.failed or self._whole.failed)
             if single:  # a batch of one would need a new compilation
                 inputs = map_tensors(lambda x: torch.cat((x, x)), inputs)
             any_number = not (compiled or trait(self.init, "fixed_pairs"))
             most = trait(self.init, "pairs_at_once")
             result = in_parts(lambda part: self._whole(self._solve, part, call), inputs, most, any_number)
+        if plain:  # copies outside of inference mode can be used where gradients are recorded
+            result = map_tensors(torch.clone, result)
         result = restore_leading(size, map_tensors(lambda x: x[:1], result) if single else result)
         if rig:
             result = result._replace(intrinsics=given_cameras(intrinsics, size, result.translation))

@@ -345,6 +345,21 @@ def test_a_data_loader_returns_results_and_loaded_weights_can_be_trained(name):
         assert all(x.requires_grad for x in PnPNet.from_pretrained(name).parameters())
 
 
+@pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac"])
+def test_results_without_gradients_can_be_used_where_gradients_are_recorded(name):
+    """Such calls run in inference mode, whose tensors cannot be saved for a backward pass."""
+    solver, inputs = create_solver(name), SyntheticProblems(n=9, batch_size=40, seed=0).batch(0)[:3]
+    result = solver(*inputs)
+    assert not any(x.is_inference() for x in iter_tensors((result, result.covariance(*inputs))))
+    pixels = inputs[1].clone().requires_grad_()
+    recorded = solver(inputs[0], pixels, inputs[2])  # what the first call cached serves this call, too
+    (recorded.translation * result.translation).sum().backward()
+    assert pixels.grad.abs().amax((1, 2))[result.ok].min() > 0
+    assert torch.allclose(recorded.translation, result.translation, rtol=1e-4, atol=1e-4)
+    with torch.inference_mode():
+        assert solver(*inputs).translation.is_inference()
+
+
 # --- devices and torch.func -------------------------------------------------------------------------------------------
 
 

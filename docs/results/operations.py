@@ -81,7 +81,8 @@ _ELEMENTWISE = {
         ("diagonal empty empty_like expand eye fill flip full full_like gather index index_copy index_put", 0),
         ("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero ones ones_like", 0),
         ("permute promote_types rand randperm repeat scalar_tensor scatter select slice split split_with_sizes", 0),
-        ("flatten roll squeeze stack t take_pairs transpose unbind unsqueeze view zero zeros zeros_like", 0),
+        ("flatten roll select_scatter squeeze stack t take_pairs transpose unbind unsqueeze view", 0),
+        ("zero zeros zeros_like", 0),
         ("add rsub scatter_add sub", ADD),
         ("mul square", MULTIPLY),
         ("div floor_divide reciprocal remainder", DIVIDE),
@@ -202,6 +203,10 @@ class OperationCounter(TorchDispatchMode):
         self.total = 0.0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with self:  # in inference mode, operations that consist of others arrive whole
+            output = func.decompose(*args, **(kwargs or {}))
+        if output is not NotImplemented:
+            return output
         output = func(*args, **(kwargs or {}))
         names = [argument.name for argument in func._schema.arguments]
         call = {argument.name: argument.default_value for argument in func._schema.arguments}

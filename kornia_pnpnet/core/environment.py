@@ -17,7 +17,7 @@ import torch
 #: so that a test can find results files that are too old. Files without a number were measured before the first change.
 BEHAVIOUR = 3
 
-# What decides results: written results do not count as changes of a checkout.
+# Git paths that decide measured results. Other files, such as written results, do not count as changes of a checkout.
 _MEASURED = ("*.py", "kornia_pnpnet", "conf")
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
 # Distributions of OpenCV on PyPI, the most common distribution first.
@@ -30,8 +30,7 @@ def environment() -> dict[str, Any]:
     Returns:
         ``versions`` by package (``None`` if not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
         ``gpu`` (``None`` without a GPU), ``date`` in UTC, ``behaviour`` (``BEHAVIOUR``), and the git ``commit`` of the
-        package (``None`` outside a checkout). The commit ends with ``+`` if Python files, weights or
-        configurations have changes.
+        package (``None`` outside a checkout), with a final ``+`` if Python files, weights or configurations changed.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},

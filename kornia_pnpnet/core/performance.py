@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import wraps
 from itertools import accumulate
@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 
@@ -30,7 +31,7 @@ exporting = torch.compiler.is_exporting
 
 
 def sees_values(x: Tensor) -> bool:
-    """Whether Python may read the values: not during tracing, under ``torch.func.vmap`` or on the device ``meta``."""
+    """Whether Python can read the values: not in tracing, not under ``torch.func.vmap``, not on the device ``meta``."""
     if compiling():
         return False
     functorch = torch._C._functorch
@@ -60,6 +61,16 @@ def full_precision(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return run
 
 
+def needs_graph(tensors: Iterable[Tensor]) -> bool:
+    """Whether PyTorch must record or trace the operations on some tensors. If not, use :class:`torch.inference_mode`.
+
+    In inference mode, a problem that is solved alone takes a sixth less time.
+    """
+    if compiling() or torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0:
+        return True
+    return torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+
+
 _TURN = [threading.RLock()]
 if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even if a thread of its parent holds the lock
     os.register_at_fork(after_in_child=lambda: _TURN.__setitem__(0, threading.RLock()))
@@ -68,13 +79,12 @@ if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even i
 def in_turn(x: Tensor) -> AbstractContextManager[Any]:
     """Return a context in which threads run one after the other, if ``x`` has few numbers (see :func:`are_few`).
 
-    If four threads do not take turns, they wait for Python's lock at each operation, and take 2.5 times as long as one
-    thread.
+    Without turns, four threads wait for Python's lock at each operation, and take 2.5 times as long as one thread.
     """
     return _TURN[0] if are_few(x) else nullcontext()
 
 
-# Largest size of a small tensor. On a CPU, the call of an operation on a small tensor takes longer than its arithmetic.
+# Largest size of a small tensor. On a CPU, calling an operation on a small tensor takes longer than the arithmetic.
 # For one 6×6 system, LAPACK takes 55 µs, and a loop over the entries takes 293 µs.
 _FEW_NUMBERS = 4096
 
@@ -133,8 +143,8 @@ def keep_freed_memory() -> None:
 
 # --- order ------------------------------------------------------------------------------------------------------------
 
-# Largest number of pairs that compiled code sorts by comparisons, which compile to one loop. For 9 pairs in each of
-# 1000 problems, the loop takes 31 µs and `Tensor.sort` takes 65 µs. With two keys, the times are 60 and 200 µs.
+# Up to this number of pairs, compiled code sorts by comparisons, which the compiler fuses to one loop. For 1000
+# problems of 9 pairs, the loop takes 31 µs and `Tensor.sort` takes 65 µs. With two keys, the times are 60 and 200 µs.
 _FEW_PAIRS = 12
 
 
@@ -175,7 +185,7 @@ def _sorted_rows(values: Tensor) -> list[Tensor]:
 def present_first(present: Tensor) -> Tensor:
     """Find positions (B, N) that move present pairs before absent pairs and otherwise keep the order."""
     places = torch.arange(present.shape[1], device=present.device)
-    # The keys are unique, because PyTorch's top-k is not stable.
+    # The keys are made unique, because PyTorch's top-k is not stable.
     return _ascending(torch.where(present, places, places + present.shape[1]))
 
 
@@ -196,7 +206,7 @@ def _ascending(keys: Tensor) -> Tensor:
 
 
 def _order_by_counting(*keys: Tensor) -> Tensor:
-    """Find the stable ascending order by keys (N, *): count the entries before each. The first key has priority."""
+    """Find the stable ascending order by keys (N, *), of which the first has priority."""
     first = keys[0]
     position = torch.arange(first.shape[0], device=first.device).view(-1, *(1,) * (first.ndim - 1))
     before = position < position[:, None]  # entry (i, j): whether entry j precedes entry i
@@ -245,9 +255,9 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
 
 # --- compilation ------------------------------------------------------------------------------------------------------
 
-# Smallest number of pairs at which the CPU compiler of PyTorch 2.13 must not choose the order of loops. With the chosen
-# order, compiled code may transpose blocks of 16 numbers. Results are then incorrect if a problem has more pairs than
-# the batch has problems. Below this number the compiler chooses, because code otherwise takes up to 50 % longer.
+# Smallest number of pairs at which the CPU compiler of PyTorch 2.13 must not choose the order of loops. With the
+# compiler's order, code may transpose blocks of 16 numbers, and results are incorrect if a problem has more pairs than
+# the batch has problems. For fewer pairs, the compiler chooses, because code otherwise takes up to 50 % longer.
 _MANY_PAIRS = 16
 
 

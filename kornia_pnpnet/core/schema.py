@@ -27,7 +27,7 @@ def _keep(data: Any, check: ValidatorFunctionWrapHandler) -> Any:
     return data
 
 
-#: Checks the keys that a ``TypedDict`` declares. The mapping is returned unchanged, and all other keys are kept.
+#: Checks the keys that a ``TypedDict`` declares, and returns the mapping unchanged, with all undeclared keys.
 Kept = WrapValidator(_keep)
 
 

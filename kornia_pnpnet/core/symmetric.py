@@ -77,7 +77,7 @@ class Symmetric3(NamedTuple):
 
     def divided(self, length: Tensor) -> Symmetric3:
         """Divide a covariance by a squared length, and add more than the rounding errors to its diagonal."""
-        # Entries of 0 give the length no gradient, because it would be NaN if the square of the length underflowed.
+        # Entries of 0 give the length no gradient. The gradient would be NaN if the square of the length underflowed.
         lengths = (torch.where(x == 0, length.detach(), length) for x in self)
         xx, xy, xz, yy, yz, zz = (x / unit / unit for x, unit in zip(self, lengths, strict=True))
         more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()
@@ -124,7 +124,7 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
 
 
 def equivalent_sigma(matrix: Symmetric2 | Symmetric3) -> Tensor:
-    """The sigma of isotropic noise whose covariance has the same trace. NaN if the trace is negative or not finite."""
+    """The sigma of isotropic noise with the trace of ``matrix``. NaN if the trace is negative or not finite."""
     variance = torch.stack([row[-1] for row in _lower_rows(matrix)]).mean(0)
     positive = (variance > 0) & (variance < torch.inf)  # the square root has an infinite gradient at 0
     sigma = torch.where(positive, variance, 1.0).sqrt()

@@ -14,13 +14,13 @@ _CALLS = 8
 
 
 class GradientWatch:
-    """Warn once if no problem of the first 8 batches that need a gradient is ``ok``. Only the 8th call reads values."""
+    """Warn once if the first 8 batches that need a gradient have no ``ok`` problem. Only the 8th call reads values."""
 
     def __init__(self) -> None:
         self._solved: list[Tensor] = []
 
     def see(self, ok: Tensor, *inputs: Tensor | None) -> None:
-        """Record ``ok`` of a batch, bool, of any shape, if any of the inputs requires a gradient."""
+        """Record ``ok`` of a batch, bool of any shape, if an input requires a gradient."""
         learns = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
         # A tensor of `torch.func` must not outlive its transform. Values cannot be read while a CUDA graph is captured.
         readable = sees_values(ok) and not torch._C._functorch.is_functorch_wrapped_tensor(ok)

@@ -26,8 +26,8 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
 
     The model is in the folder ``path`` or in one of its sub-folders ``dslr_calibration_undistorted`` (ETH3D),
     ``sparse/0`` and ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image
-    observes a point twice, the first pixel is used. Points behind the camera and points without finite pixels are dropped.
-    All pairs of a model count as inliers.
+    observes a point twice, the first pixel is used. Points behind the camera and points without a finite pixel are
+    dropped. All pairs of a model count as inliers.
 
     A file of matches is an ``.npz`` file with the matches of V images. The file has the arrays ``names`` (V,),
     ``K`` (V, 3, 3), ``R`` (V, 3, 3), ``t`` (V, 3) and ``size`` (V, 2) with widths and heights. The names of all other

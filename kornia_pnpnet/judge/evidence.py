@@ -1,19 +1,20 @@
 r"""The evidence for a pose: how much likelier the pairs are with this pose than without a pose.
 
-The residual of an inlier is Gaussian. One inlier in ten has three times the standard deviation of the others. The
+The residual of an inlier is Gaussian. One inlier in ten has three times the standard deviation of the rest. The
 pixel of an outlier is uniformly distributed. Let :math:`w` be the share of inliers, and let :math:`s` multiply all
 variances. Let :math:`d_i(s)` be the density of pair :math:`i` as an inlier, divided by its density as an outlier. The
 log-likelihood ratio
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
-leaves out its three largest terms, because some pose fits any three pairs. The vote :math:`v_i` is the inverse of the
-number of pairs with about the same pixel and point. Expectation-maximisation (EM) estimates :math:`w`. If the noise is
-unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1 or, with lower prior probability, a power of 8.
+leaves out its three largest positive terms, because some pose fits any three pairs. The vote :math:`v_i` is the inverse
+of the number of pairs with about the same pixel and point. Expectation-maximisation (EM) estimates :math:`w`. If the
+noise is unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1 or, with lower prior probability, a
+power of 8.
 
-The mean of :math:`\exp L(s)` is weighted by the prior probability of :math:`s`. The *evidence* is the logarithm of this
-mean, minus the logarithm of the number of minimal samples, minus the logarithm of the number of poses per sample. A
-pose is *believed* if its :func:`probability` suffices.
+Let :math:`M` be the mean of :math:`\exp L(s)`, weighted by the prior probability of :math:`s`. The *evidence* is
+:math:`\log M - \log n - \log k` for :math:`n` minimal samples and at most :math:`k` poses per sample. A pose is
+*believed* if its :func:`probability` suffices.
 
 The results have no gradient.
 """
@@ -61,33 +62,33 @@ _SCALES = 6
 _UNEXPECTED = -3.0
 # Rounds of EM that estimate the share of inliers at each fixed `s`, and final rounds that estimate both `s` and share.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
-# For the heavy tails of real residuals, the share `_TAIL` of the inliers (the wide component) has `_WIDE` times the
-# variance of the others. Without this component, success on indoor RGB-D matches falls by 2.5 percentage points.
+# Real residuals have heavy tails: a share `_TAIL` of the inliers (the wide component) has `_WIDE` times the variance of
+# the rest. Without this component, success on indoor RGB-D matches falls by 2.5 percentage points.
 _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
 # Two pairs are copies if their pixels are in one cell of a grid, and their points are in one cell of another grid. The
-# sizes of the cells are in focal lengths for pixels, and in units of the normalised world for points.
+# unit of `_PIXEL_CELL` is the focal length, the unit of `_POINT_CELL` is that of the normalised world.
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
-# Largest number of poses of a minimal sample.
+# Largest number of poses per minimal sample.
 _POSES = 4
 # To make equal rows adjacent, rows are sorted by a key: the sum of their entries times powers of this number. The
 # number is transcendental, so that different rows of integers have different keys.
 _KEY = math.pi / 4
 
-#: A pose is believed when its :func:`probability` is at least this value, about that of two standard deviations.
+#: Least :func:`probability` of a believed pose. About this share of Gaussian errors lies within two sigmas.
 LEAST_PROBABILITY = 0.955
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
 #: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.
 LAW = (-0.2726, 0.6495, -0.2213)
-# Ranges to which the variables of `LAW`, the evidence and the logarithm of `pose_sigma`, are clipped.
+# Ranges to which the evidence and the logarithm of `pose_sigma` are clipped in :func:`probability`.
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
-# Largest standard deviation of plausible noise in radians. The value 0.0125 would reject 4 % of the correct poses of
+# Largest standard deviation, in radians, of plausible noise. The value 0.0125 would reject 4 % of the correct poses of
 # indoor RGB-D matches (`rgbd/indoor.npz`, without a ratio test).
 _MOST_NOISE = 0.016
-# A point lies off a line if its distance from it exceeds this factor times the standard deviation along the line.
+# A point is off a line if its distance from the line exceeds this multiple of the standard deviation along the line.
 _OFF = 0.05
 # The required number of points off the line is the number of inliers minus this number, but at least 1 and at most 3.
 _FEW = 5
@@ -101,8 +102,8 @@ class Votes(NamedTuple):
     Attributes:
         pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
         known: whether the caller gave any noise of the problem, bool (B, 1).
-        outlier: density of an outlier's pixel, divided by the largest value of the narrow component of an inlier's
-            density. This ratio is for a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
+        outlier: density of an outlier's pixel, divided by the peak of the narrow component of an inlier's density, for
+            a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
     """
 
     pairs: Tensor
@@ -164,8 +165,8 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Relative densities (B, N) of inliers, of inliers if the wide component is divided by 9, and of outliers."""
-        # `exp2` is faster than `exp`, which takes 50 times as long on a CPU where the result underflows (MKL).
+        """Relative densities (B, N): inliers, inliers with the wide component divided by 9, and outliers."""
+        # `exp2` is faster than `exp`. On a CPU (MKL), `exp` takes 50 times as long if the result underflows.
         scaled = exponent / (math.log(2.0) * self.variance)
         narrow, wide = scaled.exp2(), (scaled / _WIDE).exp2()
         share = _TAIL / (1.0 - _TAIL) / _WIDE
@@ -173,7 +174,7 @@ class Mixture(NamedTuple):
         return inlier, weighted, (self.variance / self.share - self.variance) * outlier
 
     def weights(self, seen: AtPose) -> Tensor:
-        """Robust weights (B, N), at most 1: derivatives of the negative log-likelihood by ``-exponent / variance``."""
+        """Robust weights (B, N): derivatives of the negative log-likelihood by ``-exponent / variance``, at most 1."""
         inlier, weighted, outlier = self.densities(seen.exponent, seen.outlier)
         return weighted / (inlier + outlier)
 
@@ -205,7 +206,7 @@ class Evidence(NamedTuple):
 
 @torch.no_grad()
 def copies(rows: Tensor, there: Tensor) -> Tensor:
-    """Count, for each row of (B, N, C), the equal rows among those ``there``, bool (B, N). Each count is at least 1."""
+    """For each row of (B, N, C), count the equal rows that are ``there``, bool (B, N). Each count is at least 1."""
     key = _KEY ** torch.arange(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     order = (rows * key).sum(-1).argsort(1)
     ordered = rows.gather(1, order[..., None].expand_as(rows))
@@ -240,7 +241,7 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
     log_ratio = likelihood.logsumexp(0)[:, 0] - (_POSES / 6.0 * samples).log()
     best = likelihood.argmax(0, keepdim=True)
     variance, share = (x.gather(0, best)[0] for x in (factors, share))
-    # At the smallest angle of the grid, the bound is about 0, because the noise can be smaller than this angle.
+    # At the smallest variance of the grid, the lower bound is about 0, because the noise can be even smaller.
     least = torch.where(best[0] > 0, _STEP**-0.5 * variance, torch.finfo(share.dtype).eps ** 2 * variance)
     mixture = Mixture(variance, share, least, total)
     for _ in range(_FINAL_ROUNDS):
@@ -286,11 +287,10 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, odds: Tensor | None = None) -> Tensor:
     """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The probability is the product of three probabilities: a logistic function of the evidence and of log
-    :func:`pose_sigma`, the probability :func:`within_limits` of a small error, and the probability from the log-odds
-    ``odds`` (B,) of the pose against other poses (``None``: there are none). The result is 0 if the points of the
-    inliers lie on a line, or if the noise is implausible, because pairs of a wrong convention, such as mirrored pixels,
-    have large residuals. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
+    The result is the product of three probabilities: a logistic function of the evidence and of log :func:`pose_sigma`,
+    the probability :func:`within_limits`, and the logistic function of ``odds`` (B,), the log-odds of the pose against
+    other poses (``None``: there are none). The result is 0 if the points of the inliers lie on a line, or if the noise
+    is implausible, as with mirrored pixels. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
@@ -317,7 +317,7 @@ def within_limits(sigma: Tensor) -> Tensor:
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
     """Standard deviation of the pose in units of the largest errors of a correct pose, float64, (B,).
 
-    The variance sums the variances of rotation, translation and an unknown focal length (as a change of the distance).
+    The squared result sums the variances of rotation, translation and an unknown focal length (a change of distance).
     ``precision`` is the inverse variance (or covariance) of each pixel in px^-2, (B, N), 0 for outliers. The result is
     infinite for an undetermined pose.
     """
@@ -371,7 +371,7 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
     """
     world, inliers = world_points.permute(2, 1, 0), inliers.mT  # (3, N, B) and (N, B)
     weights = there = inliers.to(world.dtype)
-    # Without inliers, or if all inliers are the same point, numbers are NaN, and the last comparison is False.
+    # Without inliers, or if all inliers are the same point, numbers are NaN, and the result is False.
     for _ in range(_LINE_ROUNDS):
         share = weights / weights.sum(0)
         centred = world - (share * world).sum(1, keepdim=True)

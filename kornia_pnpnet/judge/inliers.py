@@ -1,8 +1,8 @@
 r"""Find the inliers of a pose by thresholds.
 
 A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
-:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. The left side divided by the
-right side is the *standardised* squared residual.
+:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. The *standardised* squared
+residual is the left side divided by the right side.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Judged(NamedTuple):
     r"""Inliers and residuals of one pose per problem.
 
     Attributes:
-        weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for all other pairs, shape :math:`(B, N)`.
+        weights: :math:`\tau^2 / (\tau^2 + (f \omega / z)^2)` for inliers, 0 for other pairs, shape :math:`(B, N)`.
         errors: standardised squared residuals, :data:`MAX_ERROR` behind the camera, shape :math:`(B, N)`.
     """
 
@@ -70,7 +70,7 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
 
 
 def median_residual(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
-    """Median (B, 1) of the squared residuals (B, N) of the pairs ``there``, bool (B, N); infinite without a pair.
+    """Median (B, 1) of squared residuals (B, N), of the pairs where ``there`` (B, N) is true. Infinite without a pair.
 
     The median ignores the ``fitted`` smallest residuals, because a state can fit ``fitted`` pairs exactly.
     """

@@ -32,7 +32,8 @@ _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # the median distance of the pixels from the principal point. The number was tuned on random problems with fields of
 # view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# `search_on` converts noise of points to pixels at the depth of a pose, but at least at this depth (normalised units).
+# `search_on` converts the noise of points to pixels at the depth of the pose. Smaller depths are raised to this depth
+# in units of the normalised world.
 _NEAREST = 0.5
 # _DOUBT is the chance to draw a pair of weight 0 over the chance to draw a pair of weight 1. _LEAST_TRUST is this ratio
 # for confidences 0 and 1, and smaller, because a caller's confidences are more reliable than a network's weights.

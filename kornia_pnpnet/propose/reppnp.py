@@ -53,7 +53,8 @@ class REPPnP(Initialiser):
       points toward the depth of the centroid, which reduces the effect of outliers.
     - Outliers are rejected by their leave-one-out error. The quantile is 50 % (paper: 25 %).
     - A second loop fits a rigid motion by Gauss-Newton on the algebraic error, and rejects outliers of this motion. The
-      final pose minimises the error. The paper alternates between combinations of four null vectors and rigid motions.
+      final pose minimises the error. The paper's loop alternates between a rigid motion and a combination of four null
+      vectors.
     - Both loops have a fixed length. The paper's loop stops when the quantile no longer decreases.
 
     The selection of pairs has no gradient. The last Gauss-Newton steps start from a detached pose, and their gradient

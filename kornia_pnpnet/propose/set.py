@@ -61,7 +61,8 @@ _JUDGED = 50.0
 _LEAST_VOTE = 0.5
 # If the minimal samples have more slots for poses than this number, a CPU removes the empty slots before scoring.
 _MANY_SLOTS = 64
-# The noise of points is converted to pixels at the depth of a pose, but at least at this depth (normalised units).
+# The noise of points is converted to pixels at the depth of the pose. Smaller depths are raised to this depth in units
+# of the normalised world.
 _LEAST_DEPTH = 0.5
 # If `search_on` follows, the network sees at most this number of pairs, but the search uses all pairs. On real matches
 # and on random problems of up to 1000 pairs, limits of 32 to 96 pairs give the same success rate as no limit.

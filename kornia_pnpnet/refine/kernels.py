@@ -1,9 +1,9 @@
 r"""Robust kernels, which weight a pair by its squared residual, and hyperparameters that are learned within bounds.
 
-A kernel has a loss :math:`\rho(s)` of the squared residual :math:`s`, and its derivative :math:`w(s)`. Residuals are in
-pixels of the normalised camera or, if the noise is known or estimated, in standard deviations. The *shape* of a kernel
-is a scale in the unit of the residual (``huber``, ``cauchy``, ``geman_mcclure``, ``truncated``), or for ``power`` the
-exponent :math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net. To add a kernel, extend :data:`KERNELS`.
+A kernel has a loss :math:`\rho(s)` of the squared residual :math:`s`. The weight :math:`w(s)` is the derivative of the
+loss. Residuals are in standard deviations if the noise is known or estimated, else in pixels of the normalised camera.
+The *shape* of a kernel is a scale in the unit of the residual. Only for ``power``, the shape is the exponent
+:math:`\alpha` of the weight :math:`w = 1/\|r\|^\alpha` of PnP-Net. To add a kernel, extend :data:`KERNELS`.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from kornia_pnpnet.core.checks import check_numbers, check_whole
 
 __all__ = ["KERNELS", "POWER_FLOOR", "BoundedParameter", "RobustKernel"]
 
-#: ``power`` adds the square of this number (in pixels or sigmas) to squared residuals. The weight at 0 is then finite.
+#: ``power`` adds the square of this number (in pixels or sigmas) to squared residuals, so that no weight is infinite.
 POWER_FLOOR = 0.1
 # Largest absolute value of a raw parameter. The sigmoid of 1000 rounds to 1 in float64.
 _BOUND = 1e3
 
 
 class RobustKernel(NamedTuple):
-    """A robust loss of the squared residual, its derivative, and the range of its one shape parameter.
+    """A robust loss of the squared residual, the derivative of the loss, and the range of the shape.
 
     Attributes:
-        loss: ``loss(sq_residual, shape)``, non-decreasing, and 0 for a residual of 0.
+        loss: ``loss(sq_residual, shape)``, which is 0 for a residual of 0 and never decreases.
         weight: ``weight(sq_residual, shape)``, the derivative of ``loss`` with respect to ``sq_residual``.
         default: the classical value of the shape.
         lower: the smallest shape that may be learned.
@@ -48,8 +48,8 @@ class RobustKernel(NamedTuple):
 
 def _power_loss(sq_residual: Tensor, alpha: Tensor) -> Tensor:
     # The loss is the integral of the weight (s + c)^(-alpha/2) from 0 to s, where c is `floor`. With e = 1 - alpha/2
-    # and L = log(1 + s/c), the integral is c^e L (exp(e L) - 1) / (e L). Close to e L = 0, a series replaces the last
-    # factor, so that the loss is smooth at alpha = 2.
+    # and L = log(1 + s/c), the integral is c^e L (exp(x) - 1) / x at x = e L. Close to x = 0, a series replaces the
+    # fraction, so that the loss is smooth at alpha = 2.
     floor = POWER_FLOOR**2
     exponent = 1.0 - 0.5 * alpha
     log_ratio = torch.log1p(sq_residual / floor)
@@ -95,7 +95,7 @@ KERNELS: dict[str, RobustKernel] = {
     ),
     "truncated": RobustKernel(
         loss=lambda square, scale: torch.minimum(square, scale * scale),
-        # Distributed training expects a gradient of every parameter: the zero term keeps the scale in the graph.
+        # The zero term gives the scale a gradient of 0. Distributed training expects a gradient of every parameter.
         weight=lambda square, scale: (square < scale * scale).to(square.dtype) + 0.0 * scale,
         default=30.0,
     ),
@@ -103,9 +103,7 @@ KERNELS: dict[str, RobustKernel] = {
 
 
 class BoundedParameter(nn.Module):
-    """Learned values within bounds.
-
-    A sigmoid maps the raw parameter to ``[lower, upper]``, in log space if ``logarithmic``.
+    """Learned values: a sigmoid maps the raw parameter to ``[lower, upper]``, in log space if ``logarithmic``.
 
     Args:
         initial: initial value of each entry, within the bounds. Training never changes a value at a bound.

@@ -52,7 +52,7 @@ _MAX_RESIDUAL = 2.0
 _ROUNDING = 100.0
 # Estimated noise of the points is replaced by 0 only if the log-likelihood then rises by more than this number.
 _EXPECTED = 2.0
-# The damping is multiplied by these after a rejected and an accepted step (Marquardt 1963; only with `reject_worse`).
+# Factors of the damping after a rejected step and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
 
 
@@ -60,15 +60,15 @@ class Plan(NamedTuple):
     r"""The inputs of all iterations of a refinement. Weights and sigmas have the shape :math:`(B, N)`.
 
     Attributes:
-        problem: the problem with the caller's weights. Its noise is known for every pair or ``None``.
-        prior: weight of each pair in ``judge``, before the robust weight. This is the caller's weight if there are
-            iterations by residual (see :class:`RobustWeightedLM`), else the caller's times the initialiser's weight.
-        guided: the product of the caller's and the initialiser's weights, divided by the largest product.
-        by_residual: ``prior`` divided by the mean of its positive entries; ``guided`` if no iteration is by residual.
-        state: the initial states, a batch of size :math:`S B`: the first state of every problem, then the second, ….
+        problem: the problem with the caller's weights. The noise of the problem is known for every pair, or ``None``.
+        prior: weight of each pair in ``judge``, without the robust weight: the caller's weight if there are iterations
+            by residual (see :class:`RobustWeightedLM`), else the product of the caller's and the initialiser's weight.
+        guided: product of the caller's and the initialiser's weights, divided by the largest product of the problem.
+        by_residual: ``guided`` without iterations by residual, else ``prior`` over the mean of its positive entries.
+        state: the initial states, a batch of size :math:`S B`: the first states of all problems, then the second, ….
         world_sigma: the caller's standard deviation of each point, 0 where unknown.
         votes: see :class:`~kornia_pnpnet.judge.evidence.Votes`.
-        hyperparameters: for each iteration, the scalars step, damping and shape of the kernel.
+        hyperparameters: three scalars for each iteration: the step, the damping, and the shape of the kernel.
         starts: number :math:`S` of initial states of each problem.
     """
 
@@ -88,9 +88,10 @@ class Plan(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """The input and result of an iteration: the states, and whether the last equations could be solved, bool (B,).
+    """The input and the result of an iteration.
 
-    ``factor`` (B,) multiplies the damping. ``mixture`` is the distribution of the residuals in iterations by residual.
+    ``solved`` tells whether the last equations could be solved, bool (B,). ``factor`` (B,) multiplies the damping.
+    ``mixture`` is the distribution of the residuals in iterations by residual.
     """
 
     state: State
@@ -140,14 +141,14 @@ class RobustWeightedLM(Configured):
     :math:`\gamma`, damping :math:`\lambda` and robustness (the shape of the kernel) are learned. A problem whose
     equations cannot be solved keeps its pose, and is not ``ok``.
 
-    *Noise.* If the noise of each pair is known or estimated, residuals are divided by the standard deviation of their
-    pixel, or whitened by its covariance, at the previous estimate. Scales of kernels are then in standard deviations.
+    *Noise.* If the noise of each pair is known or estimated, each residual is divided by the standard deviation (or
+    whitened by the covariance) of its pixel at the previous estimate. Kernel scales are then in standard deviations.
 
     *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser. The kernel of
-    the last of these iterations then gives the cost of each pose. All other iterations refine the pose of lowest cost.
+    the last of these iterations then gives the cost of each pose. Later iterations refine the pose of lowest cost.
 
-    *By residual.* If ``by_residual`` is positive, the choice among poses and the last ``by_residual`` iterations ignore
-    the initialiser's weights, because by then the residuals separate inliers from outliers better. In these iterations,
+    *By residual.* If ``by_residual`` is positive, the last ``by_residual`` iterations and the choice among poses
+    ignore the initialiser's weights, because residuals then separate inliers from outliers better. In these iterations,
     a mixture of inliers and outliers (:mod:`kornia_pnpnet.judge.evidence`), fitted to residuals, replaces the kernel.
 
     Args:
@@ -155,22 +156,22 @@ class RobustWeightedLM(Configured):
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
         step: initial :math:`\gamma`, in [0, 2].
         damping: initial :math:`\lambda`, in [1e-8, 100].
-        robustness: initial shape of the kernel; ``None``: the classical value of the kernel. With 0, ``power`` is least
+        robustness: initial shape of the kernel; ``None``: the classical value of the kernel. At 0, ``power`` is least
             squares.
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
         reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. The last
-            ``by_residual`` iterations never reject. Without rejection, iterations from a distant start can diverge.
+            ``by_residual`` iterations reject no step. Without rejection, iterations from a distant start can diverge.
         by_residual: number of final iterations that ignore the initialiser's weights, at most the number of iterations
             after the choice among several poses.
         learnable: whether the hyperparameters are trained.
         backward: ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the implicit function theorem to
-            the last state, with an amount of memory that does not grow with ``m``. This gradient is exact at a minimum.
-            Step, damping and initial poses have no implicit gradient.
+            the last state, so that memory does not grow with ``m``. The implicit gradient is exact at a minimum. Step,
+            damping and initial poses have no implicit gradient.
 
     Raises:
-        BaseError: for an unknown kernel, update or backward, a negative ``m`` or ``by_residual``, or an initial value
-            out of its bounds.
+        BaseError: for an unknown kernel, update or backward, for a negative ``m`` or ``by_residual``, and for an
+            initial value outside its bounds.
 
     Example:
         >>> from kornia_pnpnet import Normalize
@@ -229,7 +230,7 @@ class RobustWeightedLM(Configured):
         return step, damping, shape
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
-        """Return a copy of ``m`` iterations. Further iterations repeat the hyperparameters of the last iteration.
+        """Return a copy with ``m`` iterations. Additional iterations repeat the hyperparameters of the last iteration.
 
         Example:
             >>> refine = RobustWeightedLM(m=5).with_iterations(20)
@@ -255,15 +256,15 @@ class RobustWeightedLM(Configured):
         return self.judge(plan, now)
 
     def begin(self, problem: Problem, starts: Starts) -> Plan:
-        """Run everything before the first iteration."""
+        """Prepare the inputs of all iterations."""
         each = zip(*(x.unbind() for x in self.hyperparameters(problem.world_points)), strict=True)
         given = problem.noise
         known = torch.zeros_like(problem.weights[:, :1], dtype=torch.bool)
-        if given is not None:  # the caller gave a sigma of any pixel or world point
+        if given is not None:  # whether the caller gave at least one sigma
             known = torch.stack(given[:2]).isfinite().any(-1).any(0)[:, None]
         problem = problems_last(problem._replace(noise=_complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
-        # The division prevents underflow. Without terms, a common factor of the weights does not change a step.
+        # The division prevents underflow. Without terms, the divisor changes no step, and needs no gradient.
         guided = by_residual = relative(prior, prior if problem.terms else prior.detach())
         if self.by_residual:
             prior = problem.weights
@@ -281,7 +282,7 @@ class RobustWeightedLM(Configured):
         return Plan(problem, *weights, state, world_sigma, Votes.of(problem, known), tuple(each), len(poses))
 
     def iterate(self, plan: Plan, m: int | None = None, *, more: int = 0, run: Runner = EAGER) -> tuple[Plan, Progress]:
-        """Run the iterations: first on all poses of a problem, then on the best pose, and finally by residual.
+        """Run iterations on several poses, on the best pose, and finally by residual, see :class:`RobustWeightedLM`.
 
         Args:
             plan: the result of :meth:`begin`.
@@ -315,9 +316,9 @@ class RobustWeightedLM(Configured):
         return plan, now
 
     def by_residuals(self, plan: Plan, now: Progress, known: Tensor, step: Tensor, damping: Tensor) -> Progress:
-        r"""One iteration by residual: fit the mixture to the residuals, and take a step with its weights.
+        r"""One iteration by residual: fit the mixture to the residuals, and take a step with the mixture's weights.
 
-        If the noise of a problem is ``known``, bool :math:`(B, 1)`, its mixture keeps the variance.
+        If the noise of a problem is ``known``, bool :math:`(B, 1)`, the variance of the mixture does not change.
         """
         assert now.mixture is not None
         problem = plan.problem._replace(weights=plan.by_residual)
@@ -330,7 +331,7 @@ class RobustWeightedLM(Configured):
         return Progress(state, solved, now.factor, mixture)
 
     def judge(self, plan: Plan, now: Progress, found: Evidence | None = None, odds: Tensor | None = None) -> Refinement:
-        """Compute weights, cost, ``ok`` and, unless ``found`` is given, the evidence of the states of :meth:`iterate`.
+        """Judge the states of :meth:`iterate`. If ``found`` is ``None``, the evidence for the states is computed.
 
         ``odds`` are log-odds of the poses against other poses, shape :math:`(B,)`; ``None``: there are no other poses.
         """
@@ -350,7 +351,7 @@ class RobustWeightedLM(Configured):
         return Refinement(now.state, weights, cost, ok, in_front, chance, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
-        """Fit a mixture of inliers and outliers to the residuals. Estimated noise of points becomes 0 if likelier."""
+        """Fit a mixture to the residuals. Set estimated noise of points to 0 if residuals are likelier without it."""
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
@@ -364,7 +365,7 @@ class RobustWeightedLM(Configured):
         other = (second > first + _EXPECTED).long()
         index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
         noise, mixture = taken((both, found.mixture), index)
-        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # strides as after an iteration: both share one graph
+        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # strides as after an iteration: one compiled graph
         return plan._replace(problem=plan.problem._replace(noise=noise)), now._replace(mixture=mixture)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
@@ -378,7 +379,7 @@ class RobustWeightedLM(Configured):
             return Progress(state, solved, now.factor)
         new = self._cost(project(state, problem), problem, problem.weights, shape)
         old = self._cost(projection, problem, problem.weights, shape)
-        # At a minimum, both costs differ by rounding errors. Accept the step, because a rejected step has no gradient.
+        # At a minimum, costs differ only by rounding errors. The step is accepted, because rejection has no gradient.
         rounding = _ROUNDING * torch.finfo(new.dtype).eps
         better = new <= old * (1.0 + rounding) + (rounding * projection.focal).square()
         factor = torch.where(better, now.factor * _DAMPING_DOWN, now.factor * _DAMPING_UP)
@@ -386,7 +387,6 @@ class RobustWeightedLM(Configured):
         return Progress(kept, solved, factor)
 
     def _by_kernel(self, state: State, problem: Problem, shape: Tensor) -> tuple[Projection, NormalEquations]:
-        """The normal equations with the weights of the kernel."""
         projection = project(state, problem)
         sq_residual, precision = information(projection, problem)
         robust = self.kernel.weight(sq_residual, shape)
@@ -415,7 +415,7 @@ class RobustWeightedLM(Configured):
         return taken(now, index)
 
     def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
-        """Robust loss of pairs and terms, divided by the number of pairs that have a weight, shape (B,)."""
+        """Robust loss of pairs and terms, divided by the number of pairs with a positive weight, shape (B,)."""
         sq_residual, precision = information(projection, problem)
         # The bound in square pixels, times the mean precision of both coordinates, is the bound in variances.
         most = (_MAX_RESIDUAL * projection.focal).square().reshape(-1, 1)
@@ -432,10 +432,9 @@ class RobustWeightedLM(Configured):
         r"""Attach the gradient of the minimiser to a converged state, by the implicit function theorem.
 
         At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
-        Each added Newton step has this gradient and the value 0. If the Newton matrix is not positive definite, the
-        Gauss-Newton matrix replaces it. The second step makes second derivatives exact. The solver assumes a symmetric
-        matrix. Covariances of points rotate with the pose, so that the Newton matrix is not exactly symmetric. A third
-        step removes most of the resulting error.
+        Each added Newton step has this gradient and the value 0. The second step makes second derivatives exact. If the
+        Newton matrix is not positive definite, the Gauss-Newton matrix replaces it. Covariances of points make the
+        Newton matrix slightly asymmetric, which the solver ignores. A third step removes most of this error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
@@ -475,9 +474,9 @@ def taken(tree: _T, index: Tensor) -> _T:
 
 
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """The noise of every pair: its sigmas are the initialiser's, or else the caller's; covariances are the caller's.
+    """Complete the noise of every pair: sigmas are the initialiser's, and covariances are the caller's.
 
-    If the initialiser gave no noise, unknown sigmas become 0. Without any noise, the result is ``None``.
+    If the initialiser gave no noise, sigmas are the caller's, or 0 if unknown. Without any noise, return ``None``.
     """
     given = starts.noise if problem.noise is None else problem.noise
     if given is None:

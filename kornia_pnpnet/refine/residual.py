@@ -2,9 +2,9 @@
 
 The pose maps points by ``x_cam = R x_world + t``. The camera looks along +z. Pixels belong to a camera with a single
 focal length and the principal point 0. A point is *in front* when its depth exceeds ``MIN_DEPTH_RATIO`` times its
-distance. The test does not depend on the unit of the world.
+distance. This test does not depend on the unit of the world.
 
-Dimensions of arrays are coordinates, pairs and problems, in this order, so that operations run over long rows of
+The dimensions of tensors are coordinates, pairs and problems, in this order, so that operations run over long rows of
 memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection (``tests/test_kornia_fit.py``),
 but take three times as long for 1000 problems of 9 pairs.
 """
@@ -46,10 +46,10 @@ __all__ = [
 
 #: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. Otherwise ``|x / z|`` is below 1000.
 MIN_DEPTH_RATIO = 1e-3
-# Largest changes in one step: of the logarithm of the focal length, and of a coefficient of radial distortion. The
-# exponential of a larger change could overflow.
+# Largest change of the logarithm of the focal length, and of a coefficient of radial distortion, in one step. The
+# exponential of a larger change of the logarithm could overflow.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
-# Lower bound of the denominator 1 + tr(R) of the tangent vector of a rotation R. At a half turn, 1 + tr(R) is 0.
+# Lower bound of the denominator 1 + tr(R) in `tangent`. At a half turn, 1 + tr(R) is 0.
 _LEAST_DENOMINATOR = 1e-4
 
 # The entries for u and v in one column of the Jacobian. An entry that is the same for all pairs is a Python number.
@@ -70,7 +70,7 @@ class Projection(NamedTuple):
         state: the state.
         stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
             ``None``: there is no distortion.
-        slope: twice the derivative of :math:`d` by :math:`\rho^2`, shape :math:`(N, B)`; or ``None``.
+        slope: twice the derivative of :math:`d` by :math:`\rho^2`, shape :math:`(N, B)`; ``None``: no distortion.
     """
 
     residual: Tensor
@@ -112,7 +112,7 @@ class NormalEquations(NamedTuple):
 def project(state: State, problem: Problem) -> Projection:
     """Project the points of a problem, and subtract their pixels :math:`b`: the residual is :math:`f d (p, q) - b`.
 
-    The depth of points behind the camera is replaced before the division, so that values and gradients are finite.
+    The depth of points behind the camera counts as infinite, so that values and gradients are finite.
 
     Example:
         >>> problem = Problem.of(torch.tensor([[[1.0, 2.0, 4.0]]]), torch.zeros(1, 1, 2), 100.0)
@@ -209,9 +209,9 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
 def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
     """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
 
-    Without noise, squared residuals are in square pixels, and the information is 1, (1, 1). With noise, all sigmas must
-    be known. Squared residuals are then divided by the variance of their pixel, and the information is the inverse
-    variance of each pixel, (B, N), or the inverse covariance if the noise has covariances.
+    Without noise, squared residuals are in square pixels, and the information is the number 1 of shape (1, 1). With
+    noise, all sigmas must be known. The information is then the inverse covariance of each pixel if the noise has
+    covariances, else the inverse variance, (B, N). Squared residuals are weighted by the information.
     """
     noise = problem.noise
     if noise is None:
@@ -249,8 +249,8 @@ def normal_equations(
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
     """The rows of the Jacobian for u and v, times z/f, shape (6 + K, 2, N, B).
 
-    A row is y × e for the rotation, and e for the translation. Here y = R x, and e is z times the derivative of p or q
-    by the point in the frame of the pose. For one camera, the vectors e are (1, 0, -p) and (0, 1, -q).
+    A row is y × e for the rotation, and e for the translation, with y = R x. The vector e is z times the derivative of
+    p or q by the point in the frame of the pose. For one camera, the vectors e are (1, 0, -p) and (0, 1, -q).
     """
     plane = projection.plane
     if problem.rig is None:
@@ -307,7 +307,7 @@ def _entrywise_equations(
             return zero
         return total if products[0] is uu else products[0].sum(0)
 
-    # In `_columns`, columns 3 and 4 can be constants. The inner product with a constant column is only a sum.
+    # Columns 3 and 4 of `_columns` can be constants. The inner product with a constant column is only a sum.
     size = range(len(columns))
     lower = {
         (i, j): inner(weighted[j], columns[i]) if i < 5 else inner(weighted[i], columns[j])
@@ -338,7 +338,6 @@ def _columns(projection: Projection, problem: Problem) -> list[_Column]:
 
 
 def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
-    """Cross product of two vectors given by their entries."""
     return [torch.addcmul(a[i] * b[j], a[j], b[i], value=-1) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
@@ -399,7 +398,7 @@ def moved(state: State, delta: Tensor) -> State:
     The pose becomes :math:`(\mathrm{cay}(\omega) R,\; t + v)`. With a centred world, a rotation leaves the centroid in
     place, so that rotation and translation are well separated in the normal equations. The Cayley transform
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)` agrees with the
-    exponential map to second order, and needs no trigonometry. Its angle is :math:`2 \arctan(|\omega|/2)`.
+    exponential map to second order, and needs no trigonometry. The rotation angle is :math:`2 \arctan(|\omega|/2)`.
 
     The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
     zoom, so that the origin keeps its pixel and its scale.

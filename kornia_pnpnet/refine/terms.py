@@ -25,7 +25,7 @@ __all__ = ["CameraTerm", "PoseTerm", "add_term", "gravity_prior"]
 # An eigenvalue of a matrix with a unit diagonal counts as 0 if it is below this number. An eigenvalue of any other
 # information matrix counts as 0 if its ratio to the largest eigenvalue is below this number.
 _KNOWN = 1e-5
-# Squared errors are clipped at this multiple of the squared scale of the robust kernel. There, the weight is about 0.
+# Squared errors are clipped at this multiple of the kernel's squared scale. At this bound, the weight is about 0.
 _LARGEST_RATIO = 100.0
 # Default scale of the robust kernel, in standard deviations.
 _SCALE = 3.0
@@ -40,15 +40,15 @@ _MOST_MATRICES = 10_000
 def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -> PosePrior:
     """Make a prior from a measured direction of gravity, for example from an accelerometer.
 
-    The prior has no information on heading and position. The rotation of its pose maps ``world_down`` to ``cam_down``
-    with an arbitrary heading. Gradients flow to all arguments.
+    The prior has no information about heading and position. The rotation of the prior's pose maps ``world_down`` to
+    ``cam_down`` with an arbitrary heading. Gradients flow to all arguments.
 
     Args:
-        world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`; :math:`B` stands
-            for any number of leading dimensions, also for none.
+        world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`. :math:`B` stands
+            for any number of leading dimensions, including none.
         cam_down: measured direction of gravity in the camera's axes (+z forward), of the same shape as ``world_down``.
-        sigma: standard deviation of the measured direction in radians, about each axis that is perpendicular to it, a
-            number or :math:`(B,)`.
+        sigma: standard deviation of the measured direction about each perpendicular axis, in radians, a number or
+            :math:`(B,)`.
 
     Raises:
         BaseError: when the directions are not :math:`(B, 3)`, or sigma is neither a positive number nor a tensor with
@@ -72,8 +72,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     dtype = common_dtype(tensors)
     a, b = (functional.normalize(x.to(dtype), dim=-1) for x in (world_down, cam_down))
     eye = torch.eye(3, dtype=b.dtype, device=b.device)
-    # The rotation is half a turn about the bisector of both directions. Opposite directions have no bisector. The
-    # rotation is then half a turn about a perpendicular axis.
+    # The rotation is half a turn about the bisector of both directions. For opposite directions, which have no
+    # bisector, the rotation is half a turn about a perpendicular axis.
     least = a.detach().abs().argmin(-1, keepdim=True)
     across = torch.linalg.cross(a, torch.zeros_like(a).scatter(-1, least, 1.0))
     opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
@@ -86,7 +86,7 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
 
 
 def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> NormalEquations:
-    """Add a term to the normal equations of the pairs at the same state. The focal length is a scalar or (B,)."""
+    """Add a term, linearised at the same state, to the normal equations. The focal length is a scalar or (B,)."""
     weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
     weight = linear.weight / (focal if equations.unit is None else equations.unit[:, 0] * focal)
     matrix = torch.bmm(weighted, linear.jacobian).permute(1, 2, 0) * (weight / focal)
@@ -115,7 +115,7 @@ class CameraTerm(NamedTuple):
         return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
 
     def linearise(self, state: State) -> Linear:
-        """The residual holds log f minus its expected value, followed by the coefficients of radial distortion."""
+        """The residual holds log f minus the expected log f, followed by the coefficients of radial distortion."""
         assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
@@ -156,10 +156,10 @@ class PoseTerm(NamedTuple):
 
     @classmethod
     def of(cls, prior: PosePrior, centroid: Tensor, size: Tensor) -> tuple[PoseTerm, Tensor]:
-        """Express a prior in the frame of a problem. ``centroid`` and ``size`` are those of the problem's ``Frame``.
+        """Express a prior in the frame of a problem, given the ``centroid`` and ``size`` of its ``Frame``.
 
-        Also returns whether the prior is usable, bool (B,): all numbers are in range, and the information is positive
-        semi-definite. The information of an unusable prior becomes 0.
+        The second result tells which priors are usable, bool (B,). A prior is usable if its numbers are in range, and
+        its information is positive semi-definite. The information of an unusable prior becomes 0.
         """
         lengths = torch.cat((torch.ones_like(centroid), size[:, None].expand(-1, 3)), -1)
         information = prior.information * lengths[:, :, None] * lengths[:, None]
@@ -183,12 +183,12 @@ class PoseTerm(NamedTuple):
         return cls(pose, information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank), usable
 
     def errors(self, pose: Pose) -> tuple[Tensor, Tensor]:
-        """The tangent vector (B, 6) by which ``retract`` moves poses to the prior, and its squared Mahalanobis length.
+        """The tangent vector (B, 6) by which ``retract`` moves poses to the prior, and the squared Mahalanobis length.
 
         The vector contains no rotation about ``free``.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Rotate the prior's pose about the free axis until it is as close as possible to the given pose.
+        # Rotate the prior's pose about the free axis until this pose is closest to the given pose.
         free = self.free
         along = turn.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (turn @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(turn - turn.mT)).sum(-1)
@@ -228,7 +228,7 @@ class PoseTerm(NamedTuple):
         return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-self._ratio(square)))
 
     def _ratio(self, square: Tensor) -> Tensor:
-        """Ratio of squared errors to the squared scale, bounded, so that its exponential has a finite derivative."""
+        """Squared errors over the squared scale, bounded to keep derivatives of the exponential finite."""
         return torch.minimum(square, _LARGEST_RATIO * self.sq_scale) / self.sq_scale
 
     def disagreement(self, pose: Pose) -> Tensor:
@@ -238,7 +238,7 @@ class PoseTerm(NamedTuple):
 
 
 def _open_axis(information: Tensor) -> Tensor:
-    """The only axis (B, 3) about which the rotation is unknown, 0 unless exactly one such axis exists."""
+    """The axis (B, 3) about which the rotation is unknown; 0 unless exactly one such axis exists."""
     eigenvalues = _eigenvalues(information.detach().double())
     least, middle, largest = eigenvalues.unbind(-1)
     is_open = (least < _KNOWN * largest) & (middle > _KNOWN * largest)
@@ -255,8 +255,8 @@ def _open_axis(information: Tensor) -> Tensor:
 def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
     """Ascending eigenvalues (B, 6) after scaling to a unit diagonal, and whether each matrix is symmetric, (B,).
 
-    A diagonal entry of 0 takes the scale of the largest diagonal entry with the same unit, so that rounding errors in
-    its row stay small. If all diagonal entries with this unit are 0, their rows must be 0.
+    A row with a diagonal entry of 0 is scaled like the row of the largest diagonal entry with the same unit, so that
+    rounding errors in the row stay small. If all diagonal entries with the same unit are 0, their rows must be 0.
     """
     information = information.detach().double()
     diagonal = information.diagonal(dim1=1, dim2=2)
@@ -270,6 +270,5 @@ def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _eigenvalues(matrix: Tensor) -> Tensor:
-    """Ascending eigenvalues of symmetric matrices."""
     whole = matrix.device.type == "cpu" or compiling()
     return torch.cat([torch.linalg.eigvalsh(part) for part in ([matrix] if whole else matrix.split(_MOST_MATRICES))])

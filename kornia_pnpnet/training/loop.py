@@ -207,7 +207,7 @@ def fit(
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
 
     def report(since: int, before: Mapping[str, float]) -> FitReport:
-        """Report the work after the update ``since``. ``before`` holds the seconds of the clock at that update."""
+        """Report the work after the update ``since``, at which the stages had taken ``before`` seconds."""
         clock.lap("rest")
         spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
         whole = sum(spent.values())
