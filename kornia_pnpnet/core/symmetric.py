@@ -124,7 +124,7 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
 
 
 def equivalent_sigma(matrix: Symmetric2 | Symmetric3) -> Tensor:
-    """The sigma of isotropic noise with the trace of ``matrix``. NaN if the trace is negative or not finite."""
+    """Sigma of isotropic noise whose covariance has the trace of ``matrix``. NaN for a negative or infinite trace."""
     variance = torch.stack([row[-1] for row in _lower_rows(matrix)]).mean(0)
     positive = (variance > 0) & (variance < torch.inf)  # the square root has an infinite gradient at 0
     sigma = torch.where(positive, variance, 1.0).sqrt()

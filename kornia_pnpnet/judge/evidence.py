@@ -130,7 +130,8 @@ class AtPose(NamedTuple):
 
     Attributes:
         projection: the points projected at the pose.
-        exponent: minus half the squared residual over the variance of its pixel, about -∞ behind the camera, (B, N).
+        exponent: minus half the squared residual over the variance of the pixel, (B, N). Points behind the camera have
+            about -∞.
         density: the square root of the determinant of ``precision``, (B, N) or (1, 1).
         outlier: ``Votes.outlier`` divided by ``density``, (B, N) or (B, 1).
         precision: inverse variance, (B, N) or (1, 1), or inverse covariance of each pixel.
