@@ -80,7 +80,8 @@ class PnPNet(PretrainedMixin):
     Precision: the layer computes in float64 if any input tensor is float64, else in float32. Results have the dtype of
     the computation. Integer inputs are converted. Inputs in float16 or bfloat16 are also converted, because half
     precision has too few digits for a pixel. The gradient of each input has the dtype of the input.
-    :class:`torch.autocast` does not change the results.
+    :class:`torch.autocast` does not change the results. If no tensor requires a gradient, the layer computes in
+    :class:`torch.inference_mode` and returns ordinary tensors.
 
     Args:
         init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to
