@@ -556,13 +556,16 @@ def main() -> None:
     if options.seed is not None:
         print(text(call := draw(options.seed)))
         return check(call, options.seed)
-    end = time.time() + 60.0 * options.minutes
+    end, calls, failures = time.time() + 60.0 * options.minutes, 0, 0
     for seed in takewhile(lambda _: time.time() < end, count(int(time.time()) * 1000)):
         call = draw(seed)
+        calls += 1
         try:
             check(call, seed)
         except Exception:
+            failures += 1
             print(f"\n--seed {seed}: {text(call)}\n{traceback.format_exc(limit=-2)}", flush=True)
+    print(f"{calls} calls in {options.minutes:g} minutes, {failures} failures")
 
 
 if __name__ == "__main__":
