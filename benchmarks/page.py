@@ -72,12 +72,16 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         **{"cold": COLD, "cached": CACHED, "eager": EAGER, "forward": FORWARD, "backward": BACKWARD},
         successes=lambda row: str(SuccessRate(**row["success"])).replace(" %", ""),
         shipped={"m": shipped.refine.m, "views": shipped.views},
-        **{"made": throughput["environment"], "results": results, "settings": settings, "first_calls": first_calls},
+        made=throughput["environment"],
+        results=results,
+        settings=settings,
         **{"alone": alone, "two": matching(latency, threads=2), "many": many},
+        first_calls=first_calls,
         ours=[*filter(is_whole, alone)],
         peers=[name for name in PEERS if name in alone],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
-        **{"gpu": gpu, "quickest": quickest(gpu) if gpu else []},
+        gpu=gpu,
+        quickest=quickest(gpu) if gpu else [],
     )
 
 

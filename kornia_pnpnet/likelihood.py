@@ -34,7 +34,7 @@ _PRIOR_TRANSLATION = 0.5
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Depths are raised to at least this share of the distance to the points, and raising adds a penalty to the residual.
+# Least depth of a point, divided by the distance to the points. A smaller depth is raised, and the residual penalised.
 _LEAST_DEPTH = 0.02
 
 

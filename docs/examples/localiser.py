@@ -203,9 +203,8 @@ def solve_by_colmap(photos: Sequence[Photo], matches: Sequence[Matches]) -> tupl
         for photo, pairs in zip(photos, matches, strict=True)
     ]
     poses = [(x.rotation, x.translation) if x else (np.eye(3), np.zeros(3)) for x in found]
-    return Pose(*(torch.tensor(np.array(x)) for x in zip(*poses, strict=True))), torch.tensor(
-        [x is not None for x in found]
-    )
+    pose = Pose(*(torch.tensor(np.array(x)) for x in zip(*poses, strict=True)))
+    return pose, torch.tensor([x is not None for x in found])
 
 
 def errors(pose: Pose, found: Tensor, photos: Sequence[Photo], metre: float) -> list[dict[str, float] | None]:

@@ -95,10 +95,13 @@ def overview(unseen: Mapping[str, Any], seen: Mapping[str, Any]) -> dict[str, An
     return {
         **{"rows": [*ours, *others], "ours": ours, "kinds": kinds, "short": short, "scores": SCORES, "batch": BATCH},
         **{"batched": batched, "single": single, "title": title, "any": ANY, "ahead": ahead},
-        **{"scenes": len(unseen["counts"]), "right": unseen["settings"]["right"], "cpu": unseen["environment"]["cpu"]},
-        **{"total": batched[ANY]["all"].success.total, "seen_total": known[ANY]["all"].success.total},
+        "total": batched[ANY]["all"].success.total,
+        "scenes": len(unseen["counts"]),
+        "right": unseen["settings"]["right"],
         "reach": 100 * max(max(x.rate - x.low, x.high - x.rate) for x in rates),
+        "cpu": unseen["environment"]["cpu"],
         "lead": {"here": points_ahead(batched), "seen": points_ahead(known)},
+        "seen_total": known[ANY]["all"].success.total,
     }
 
 
@@ -114,12 +117,14 @@ def page_facts(
     found = totals(first)
     kinds = [kind for kind in found[ANY] if kind != "all"]
     return {
-        **{"first": first, "solver": title(ANY), "kinds": kinds, "costs": costs, "keypoints": keypoints},
+        **{"first": first, "solver": title(ANY), "kinds": kinds, "costs": costs},
         "raw": find_rows(first, kinds[1])[ANY]["all"],
         "totals": dict(sorted(found.items(), key=lambda item: -item[1]["all"].success.rate)),
-        **{"peer": best_peer(found), "reliability": first["reliability"][ANY]},
+        "peer": best_peer(found),
         "files": [facts(name, at_size(one), kinds) for name, one in ((UNSEEN, unseen), (SEEN, seen))],
         "scenes": {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")},
+        "reliability": first["reliability"][ANY],
+        "keypoints": keypoints,
         "ways": [{row["way"]: row for row in one["rows"]} for one in keypoints["results"]],
         **{"any": ANY, "with_scores": WITH_SCORES, "points_ahead": points_ahead, "title": title},
     }

@@ -131,9 +131,12 @@ def ablation(rows: Sequence[Row]) -> dict[str, Any]:
         findings.setdefault(experiment, {})[kind] = found
     rates = [[percent(row, data)[0] for row in recipe] for data in sets]
     return {
-        **{"updates": rows[0]["update"], "seeds": len(recipe), "runs": [*recipe, *others]},
-        **{"sets": sets, "verdicts": verdicts},
+        "updates": rows[0]["update"],
+        "seeds": len(recipe),
         "spread": max(max(values) - min(values) for values in rates),
+        "sets": sets,
+        "runs": [*recipe, *others],
+        "verdicts": verdicts,
         "findings": [{"experiment": name, "claim": claim(name), "found": found} for name, found in findings.items()],
     }
 

@@ -53,16 +53,23 @@ def page(overview: str) -> str:
     complexity, runs = load("complexity"), {name: rates.read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
     benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
     rigs = grouped(cameras["rigs"], "solver")
+    at_nine = complexity["n"].index(9)
     any_network: Any = PnPNet.from_pretrained(ANY).init
     files = {name: rates.Rates(entry) for name, entry in results.items()}
     return written(
         "README.md.jinja",
-        **{"ours": OURS, "paper": PAPER, "any": ANY, "results": results, "rates": files, "overview": overview},
+        ours=OURS,
+        paper=PAPER,
+        any=ANY,
         shipped_views=PnPNet.from_pretrained(OURS).views,
         made=results["paper"]["environment"],
-        operations={name: counts[complexity["n"].index(9)] for name, counts in complexity["counts"].items()},
-        **{"benchmark": benchmark, "summary_sets": SUMMARY_SETS, "accuracy_set": ACCURACY_SET},
+        results=results,
+        operations={name: counts[at_nine] for name, counts in complexity["counts"].items()},
+        overview=overview,
         summary=summary(benchmark["rows"]),
+        summary_sets=SUMMARY_SETS,
+        accuracy_set=ACCURACY_SET,
+        benchmark=benchmark,
         unknown_focal=grouped(cameras["real"], "solver"),
         rigs=rigs,
         rig_ratios=[other["us"] / own["us"] for own, other in zip(rigs[ANY], rigs["PoseLib"], strict=True)],
@@ -74,15 +81,17 @@ def page(overview: str) -> str:
         judged=load("judge")["sets"],
         rate=lambda x: str(SuccessRate(**x)),
         **{"percent": rates.percent, "compared": rates.compared, "kernel": rates.KERNEL},
-        **{"claim": rates.claim, "shown": rates.shown},
         chi_square=CHI_SQUARE_95,
         distribution_table=format_table(results["distribution"]),
         ablation=rates.ablation(runs["ablation"]),
         sweep=rates.sweep(runs["sweep"]),
+        claim=rates.claim,
         sizes={row["run"]: row for row in runs["capacity"]},
         size_sets=rates.validation_sets(runs["capacity"]),
         shipped_size="set-{width}x{layers}x{hidden}".format(**any_network.config),
         weights=shipped_weights(),
+        rates=files,
+        shown=rates.shown,
     )
 
 
@@ -103,8 +112,9 @@ def pages() -> dict[Path, str]:
     matches = load(UNSEEN), load(SEEN)
     facts = overview(*matches)
     found = {HERE / "README.md": page(written("overview.md.jinja", link="real_matches.md", **facts))}
-    of_matches = page_facts(*matches, load("real_matches_cost"), load("keypoints"))
-    found[HERE / "real_matches.md"] = written("real_matches.md.jinja", **of_matches)
+    found[HERE / "real_matches.md"] = written(
+        "real_matches.md.jinja", **page_facts(*matches, load("real_matches_cost"), load("keypoints"))
+    )
     for path in OVERVIEW_PAGES:
         link = Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix()
         block = written("overview.md.jinja", link=link, **facts)

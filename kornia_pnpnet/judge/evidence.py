@@ -76,7 +76,7 @@ _POSES = 4
 # number is transcendental, so that different rows of integers have different keys.
 _KEY = math.pi / 4
 
-#: Least :func:`probability` of a believed pose. About this share of Gaussian errors lies within two sigmas.
+#: Least :func:`probability` of a believed pose, about that of a Gaussian error within two standard deviations.
 LEAST_PROBABILITY = 0.955
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
 #: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.

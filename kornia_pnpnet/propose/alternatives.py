@@ -30,7 +30,7 @@ _LIKELIER = 30.0
 _SAME = 0.035
 # A mirror image is refined if most inliers have residuals below this number times the spread of the inliers' pixels.
 _NEAR_MIRROR = 0.2
-# A rival is another pose that may explain the pairs. The wide rival starts with a noise of at least this many radians.
+# A rival is another pose that may explain the pairs. _WIDE_ANGLE (rad) is the least initial noise of the wide rival.
 _WIDE_ANGLE = 6.4e-3
 # Index of the first entry of `Evidence.grid` with at least the noise _WIDE_ANGLE.
 _WIDE_FROM = 4
