@@ -118,7 +118,7 @@ def export_program(
 
     Raises:
         BaseError: when ``n`` is less than 3 or not the number that the network was built for, or when ``batch`` is less
-            than 1.
+            than 1 or more than 1 048 576.
         ValueCheckError: when the solver cannot be traced, or when a solver for rigs has an unknown focal length or no
             initialiser.
 

@@ -7,7 +7,7 @@ from numbers import Real
 from typing import NamedTuple
 
 import torch
-from kornia.core.exceptions import TypeCheckError
+from kornia.core.exceptions import TypeCheckError, ValueCheckError
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_devices, check_shapes, check_tensors, check_whole, common_dtype
@@ -66,7 +66,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         ranges: number of bins, :math:`K`.
 
     Raises:
-        ValueError: when the shapes differ or the tensors are empty.
+        ValueCheckError: when the shapes differ or the tensors are empty.
         BaseError: when ``ranges`` is not an integer of at least 1, or the tensors are on different devices.
 
     Example:
@@ -77,7 +77,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
     check_tensors({"chances": chances, "outcomes": outcomes})
     if chances.shape != outcomes.shape or chances.numel() == 0:
         shapes = f"{tuple(chances.shape)} and {tuple(outcomes.shape)}"
-        raise ValueError(f"chances and outcomes must have the same shape and at least one element, got {shapes}.")
+        raise ValueCheckError(f"chances and outcomes must have the same shape and at least one element, got {shapes}.")
     check_whole(1, ranges=ranges)
     check_devices({"outcomes": outcomes}, chances, "chances")
     chance, outcome = (x.detach().flatten().to(torch.float64) for x in (chances, outcomes))

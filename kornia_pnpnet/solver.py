@@ -240,8 +240,8 @@ class PnPNet(PretrainedMixin):
             TypeCheckError: for arguments that are not tensors, and for tensors of booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
             ValueCheckError: when a sigma and a covariance are both given for the pixels or for the points, when an
-                unknown focal length is combined with distortion or with a rig, or when a rig is combined with
-                ``alternatives``.
+                unknown focal length is combined with distortion or with a rig, when a rig is combined with distortion
+                or with ``alternatives``, or when neither the solver nor the call gives a start for a rig.
         """
         size, inputs = checked_inputs(
             world_points,

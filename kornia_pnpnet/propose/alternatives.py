@@ -114,7 +114,8 @@ def reconsider(
 
     If the noise is unknown and a larger noise is almost as likely, a rival starts from the refined pose with the
     larger noise. If the mirror image of the pose has small residuals, another rival starts from the mirror image. A
-    given rival is used if its rotation differs from the rotation of the pose. If the noise is unknown, a given rival
+    given rival is used if its rotation differs from the rotation of the pose, and if not nearly all pairs are inliers
+    of the pose. Without ``refine.by_residual``, only mirror images are rivals. If the noise is unknown, a given rival
     starts with a smaller noise. A rival that ends more than 10 degrees from the result makes the result less probable.
 
     Args:
