@@ -38,8 +38,6 @@ _WIDE_FROM = 4
 _GAP = 0.4
 # The wide rival is tried only if the share of inliers is below this number.
 _CLEAR = 0.9
-# An unknown variance is divided by this number at the start of a given rival (argument `rival` of `reconsider`).
-_SMALLER = 4.0
 # A given rival is tried only if its rotation differs from the refined rotation by more than this angle, in radians.
 _APART = 0.02
 # A given rival is tried only if the share of inliers is below this number.
@@ -115,8 +113,8 @@ def reconsider(
     If the noise is unknown and a larger noise is almost as likely, a rival starts from the refined pose with the
     larger noise. If the mirror image of the pose has small residuals, another rival starts from the mirror image. A
     given rival is used if its rotation differs from the rotation of the pose, and if not nearly all pairs are inliers
-    of the pose. Without ``refine.by_residual``, only mirror images are rivals. If the noise is unknown, a given rival
-    starts with a smaller noise. A rival that ends more than 10 degrees from the result makes the result less probable.
+    of the pose. A given rival starts with the noise of its own residuals. Without ``refine.by_residual``, only mirror
+    images are rivals. A rival that ends more than 10 degrees from the result makes the result less probable.
 
     Args:
         refine: the refiner.
@@ -125,8 +123,8 @@ def reconsider(
         found: the evidence for the refined poses.
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
         rival: given rivals, for example of ``search_on``, or ``None``.
-        replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. A replacing rival starts
-            with the noise of its own residuals. Other given rivals are ignored. ``None``: the likelihood selects poses.
+        replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. Other given rivals are
+            ignored. ``None``: the likelihood selects poses.
 
     Returns:
         The arguments of :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for the
@@ -149,17 +147,16 @@ def reconsider(
         if replaced is None:
             apart = valid & (share < _CLEAR_OF_RIVALS) & by_residual
             apart &= rotation_angle(rival.pose.rotation, pose.rotation) > _APART
-            narrower = torch.where(plan.votes.known, own.variance.new_ones(()), 1.0 / _SMALLER)
-            of_rival = own._replace(variance=narrower * own.variance, least=narrower.square() * own.least)
         else:
             unclear, mirrors, apart = unclear & ~replaced, mirrors & ~replaced, replaced
-            of_rival = plan.evidence_at(rival).mixture
-        kinds = (now.state, own), (now.state, wide), (now.state._replace(pose=mirrored), own), (rival, of_rival)
+        kinds = (now.state, own), (now.state, wide), (now.state._replace(pose=mirrored), own), (rival, own)
         kind, owners = torch.stack((unclear, unclear, mirrors, apart)).nonzero().unbind(1)
     if not len(owners):
         return now, found, torch.full_like(found.log_ratio, torch.inf)
     state, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
     every = taken(plan._replace(state=now.state, starts=1), owners)
+    given = kind[:, None] == len(kinds) - 1
+    mixture = map_tensors(lambda x, y: torch.where(given, x, y), every.evidence_at(state).mixture, mixture)
     tried = Progress.of(state, mixture)
     step, damping, _ = plan.hyperparameters[-1]
     for i in range(_FROZEN + _FREE):

@@ -219,8 +219,8 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
 
     Returns:
         First, the starts with the best pose, without gradient. In a searched problem, the weights are those of a Cauchy
-        kernel at the best pose, with the inlier threshold as its scale. Second, the pose with the least loss at a
-        quarter of the thresholds, for the comparison with the refined pose (see `reconsider`).
+        kernel at the best pose, with the inlier threshold as its scale. Second, the pose with the least loss at wider
+        thresholds, for the comparison with the refined pose (see `reconsider`).
 
     Raises:
         ValueCheckError: when the starts have only one pose, or no noise.

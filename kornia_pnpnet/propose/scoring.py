@@ -99,13 +99,13 @@ class Scene(NamedTuple):
         rows = self.rows.gather(2, positions[:, None, :, None].expand(-1, 3, -1, 13))
         return self._replace(rows=rows, weights=self.weights.gather(2, positions[:, None]))
 
-    def losses(self, poses: Tensor, scorer: Scorer, narrower: float = 1.0) -> Tensor:
+    def losses(self, poses: Tensor, scorer: Scorer, wider: float = 1.0) -> Tensor:
         """Losses (P, H) of poses (P, 12, H): the weighted sum of the pairs' losses, plus the losses of the priors.
 
-        Squared residuals are multiplied by ``narrower``.
+        Squared residuals are divided by ``wider``.
         """
         errors = self.errors(poses)
-        losses = (self.weights @ scorer(errors if narrower == 1.0 else errors.mul_(narrower)))[:, 0]
+        losses = (self.weights @ scorer(errors if wider == 1.0 else errors.div_(wider)))[:, 0]
         for term in map_tensors(lambda x: x[:, None], self.terms):  # broadcasts over H poses
             losses = losses + term.disagreement(as_pose(poses.mT))
         return losses

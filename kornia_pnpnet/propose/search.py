@@ -49,8 +49,8 @@ _FEW_RESIDUALS = 4096
 _IMPROVED = 3
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
-# Squared inlier threshold, divided by the square of the narrower threshold at which rivals are scored.
-_NARROWER = 16.0
+# Square of the wider threshold at which rivals are scored, divided by the squared inlier threshold.
+_WIDER = 8.0
 # The entrywise product of a rotation and of the rotation after a Newton step sums to 3. If the sum for a matrix differs
 # from 3 by at least this number, the matrix is no rotation.
 _FAR_FROM_ROTATION = 0.1
@@ -98,7 +98,7 @@ class Search:
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
         loss: loss of the best pose, shape :math:`(B,)`. The loss of a problem without a pose is infinite.
-        rivals: the unimproved pose with the least loss at a quarter of the thresholds, shape :math:`(B, 12)`.
+        rivals: the unimproved pose with the least loss at wider thresholds, shape :math:`(B, 12)`.
     """
 
     def __init__(
@@ -301,17 +301,17 @@ class Search:
     def _compared(self, problems: Tensor, scene: Scene, poses: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Ascending losses (P, K) and entries (P, 12, K) of the best of poses (P, 12, W). Better rivals are stored."""
         if self.finds_rivals:
-            loss, rival, _ = self._best_of(scene, poses, valid, 1, narrower=_NARROWER)
+            loss, rival, _ = self._best_of(scene, poses, valid, 1, _WIDER)
             better = loss[:, 0] < self.rival_loss[problems]
             at = problems[better]
             self.rival_loss[at], self.rivals[at] = loss[better, 0], rival[better, :, 0]
         return self._best_of(scene, poses, valid, _IMPROVED)[:2]
 
     def _best_of(
-        self, judges: Scene, poses: Tensor, valid: Tensor, width: int, narrower: float = 1.0
+        self, judges: Scene, poses: Tensor, valid: Tensor, width: int, wider: float = 1.0
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Ascending losses (P, K), entries (P, 12, K) and validity (P, K) of the K poses with the smallest losses."""
-        losses = judges.losses(poses, self.plan.score, narrower).masked_fill(~valid, torch.inf)
+        losses = judges.losses(poses, self.plan.score, wider).masked_fill(~valid, torch.inf)
         losses, order = losses.topk(min(width, losses.shape[1]), largest=False)
         return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
 
