@@ -18,7 +18,8 @@ from kornia_pnpnet.propose.sampling import (
     draw,
     samples_needed,
 )
-from kornia_pnpnet.propose.scoring import Scene
+from kornia_pnpnet.propose.scoring import Scene, as_pose
+from kornia_pnpnet.propose.search import Search
 from kornia_pnpnet.refine.residual import project
 
 # --- samples ----------------------------------------------------------------------------------------------------------
@@ -200,3 +201,18 @@ def test_the_gradient_is_that_of_the_result(make_problems, correspond):
         numeric = ((ends[0] - ends[1]) * probe).sum(-1) / (2 * step)
         analytic = (leaf.grad * direction).flatten(1).sum(-1)
         torch.testing.assert_close(analytic, numeric, rtol=5e-2, atol=1e-8)
+
+
+def test_rivals_are_more_accurate_if_the_noise_exceeds_the_threshold():
+    noise = {"img_sigma": 6.0, "world_sigma": 0.0, "outliers": OutlierMix(count=12)}
+    problems = SyntheticProblems(n=40, batch_size=100, seed=3, **noise).batch(0)
+    ransac = RANSAC(P3P(), threshold=3.0)
+    problem, frame = PnPNet(ransac, RobustWeightedLM(m=0)).normalize(*problems[:3])
+    limit = 3.0 * problem.img_scale[:, None]
+    search = Search(ransac, problem, Thresholds(limit, torch.zeros_like(limit)), finds_rivals=True)
+    search.run()
+    errors = [
+        pose_errors(frame.undo(as_pose(x)), problems.pose).rotation_error_deg.median()
+        for x in (search.poses, search.rivals)
+    ]
+    assert errors[1] < 0.8 * errors[0]
