@@ -50,7 +50,7 @@ _IMPROVED = 3
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
 # Square of the wider threshold at which rivals are scored, divided by the squared inlier threshold.
-_WIDER = 8.0
+_WIDER = 4.0
 # The entrywise product of a rotation and of the rotation after a Newton step sums to 3. If the sum for a matrix differs
 # from 3 by at least this number, the matrix is no rotation.
 _FAR_FROM_ROTATION = 0.1
