@@ -155,6 +155,7 @@ def reconsider(
         return now, found, torch.full_like(found.log_ratio, torch.inf)
     state, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
     every = taken(plan._replace(state=now.state, starts=1), owners)
+    # A given rival, the last kind, starts with the noise of its own residuals.
     given = kind[:, None] == len(kinds) - 1
     mixture = map_tensors(lambda x, y: torch.where(given, x, y), every.evidence_at(state).mixture, mixture)
     tried = Progress.of(state, mixture)
