@@ -159,6 +159,7 @@ class PnPNet(PretrainedMixin):
         self._run, self._whole = Runner(), Runner()
         self._watch = GradientWatch()
 
+    @in_turn
     def forward(
         self,
         world_points: Tensor,
@@ -272,7 +273,7 @@ class PnPNet(PretrainedMixin):
         compiled = self._run.compiled or self._whole.compiled
         plain = not (compiled or needs_graph((*iter_tensors(inputs), *self.parameters())))
         inference = torch.inference_mode() if plain else nullcontext()
-        with in_full_precision(inputs.world_points.device.type), in_turn(inputs.world_points), inference:
+        with in_full_precision(inputs.world_points.device.type), inference:
             single = compiled and len(inputs.world_points) == 1 and not (self._run.failed or self._whole.failed)
             if single:  # a batch of one would need a new compilation
                 inputs = map_tensors(lambda x: torch.cat((x, x)), inputs)

@@ -324,15 +324,15 @@ def test_long_sorts_stay_calls():
 def test_a_forked_process_does_not_wait_for_a_thread_of_its_parent():
     held, done = threading.Event(), threading.Event()
 
-    def hold() -> None:
-        with in_turn(torch.ones(1)):
-            held.set()
-            done.wait()
+    @in_turn
+    def hold(_: torch.Tensor) -> None:
+        held.set()
+        done.wait()
 
-    thread = threading.Thread(target=hold)
+    thread = threading.Thread(target=hold, args=(torch.ones(1),))
     thread.start()
     held.wait()
-    process = multiprocessing.get_context("fork").Process(target=lambda: in_turn(torch.ones(1)).__enter__())
+    process = multiprocessing.get_context("fork").Process(target=in_turn(torch.relu), args=(torch.ones(1),))
     process.start()
     process.join(30)
     done.set()

@@ -76,12 +76,19 @@ if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even i
     os.register_at_fork(after_in_child=lambda: _TURN.__setitem__(0, threading.RLock()))
 
 
-def in_turn(x: Tensor) -> AbstractContextManager[Any]:
-    """Return a context in which threads run one after the other, if ``x`` has few numbers (see :func:`are_few`).
+def in_turn(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Let threads call a function one after the other, if the first tensor is small (see :func:`are_few`).
 
     Without turns, four threads wait for Python's lock at each operation, and take 2.5 times as long as one thread.
     """
-    return _TURN[0] if are_few(x) else nullcontext()
+
+    @wraps(function)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        first = next(iter_tensors((*args, *kwargs.values())), None)
+        with _TURN[0] if first is not None and are_few(first) else nullcontext():
+            return function(*args, **kwargs)
+
+    return run
 
 
 # Largest size of a small tensor. On a CPU, calling an operation on a small tensor takes longer than the arithmetic.
