@@ -34,6 +34,10 @@ part uncertainty benchmarks/uncertainty.py --out benchmarks/uncertainty.json
 part cameras benchmarks/cameras.py --out benchmarks/cameras.json ${DATA:+--data "$DATA"}
 part upstream benchmarks/upstream.py --out benchmarks/upstream.json
 part scale benchmarks/scale.py --problems 10000000
+for name in fiducial_board incremental_map keypoint_offsets keypoint_pipeline localiser pose_network serve tracking; do
+    part $name docs/examples/$name.py --out docs/examples
+done
+part keypoint_covariances docs/examples/keypoint_pipeline.py --covariances --out docs/examples
 
 if [ -n "${DATA:-}" ]; then
     part results docs/results/make.py measure --scenes "$DATA"
@@ -86,3 +90,4 @@ fi
 
 "$PYTHON" benchmarks/performance.py render
 "$PYTHON" docs/results/make.py render
+"$PYTHON" docs/examples/tables.py

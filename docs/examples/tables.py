@@ -19,7 +19,9 @@ def page(name: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         results = json.loads((HERE / f"{match[2]}.json").read_text())
-        return f"{match[1]}\n\n{getattr(tables, match[2])(results)}\n<!-- end -->"
+        made = results["environment"]
+        foot = f"Measured with commit {made['commit'][:9]}, {made['date'][:10]}."
+        return f"{match[1]}\n\n{getattr(tables, match[2])(results)}\n{foot}\n<!-- end -->"
 
     text = (HERE / name).read_text()
     return re.sub(r"(<!-- (\w+)\.json, by tables\.py -->).*?<!-- end -->", table, text, flags=re.S)
