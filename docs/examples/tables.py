@@ -2,10 +2,14 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 from statistics import median
 
 from jinja2 import Environment, FileSystemLoader
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
+from harness import foot
 
 HERE = Path(__file__).resolve().parent
 PAGES = ("README.md", "clients.md")
@@ -19,9 +23,8 @@ def page(name: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         results = json.loads((HERE / f"{match[2]}.json").read_text())
-        made = results["environment"]
-        foot = f"Measured with commit {made['commit'][:9]}, {made['date'][:10]}."
-        return f"{match[1]}\n\n{getattr(tables, match[2])(results)}\n{foot}\n<!-- end -->"
+        made = foot(results["environment"])
+        return f"{match[1]}\n\n{getattr(tables, match[2])(results)}\nMeasured: {made}.\n<!-- end -->"
 
     text = (HERE / name).read_text()
     return re.sub(r"(<!-- (\w+)\.json, by tables\.py -->).*?<!-- end -->", table, text, flags=re.S)

@@ -51,11 +51,17 @@ def in_full_precision(device: str) -> AbstractContextManager[Any]:
 
 def full_precision(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """Disable autocast in a function, on the device of the first tensor among its arguments."""
+    return _within(lambda x: in_full_precision("cpu" if x is None else x.device.type), function)
+
+
+def _within(
+    context: Callable[[Tensor | None], AbstractContextManager[Any]], function: Callable[_P, _T]
+) -> Callable[_P, _T]:
+    """Call a function in the context that fits the first tensor among its arguments, or ``None``."""
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-        first = next(iter_tensors((*args, *kwargs.values())), None)
-        with in_full_precision("cpu" if first is None else first.device.type):
+        with context(next(iter_tensors((*args, *kwargs.values())), None)):
             return function(*args, **kwargs)
 
     return run
@@ -81,14 +87,7 @@ def in_turn(function: Callable[_P, _T]) -> Callable[_P, _T]:
 
     Without turns, four threads wait for Python's lock at each operation, and take 2.5 times as long as one thread.
     """
-
-    @wraps(function)
-    def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-        first = next(iter_tensors((*args, *kwargs.values())), None)
-        with _TURN[0] if first is not None and are_few(first) else nullcontext():
-            return function(*args, **kwargs)
-
-    return run
+    return _within(lambda x: nullcontext() if x is None or not are_few(x) else _TURN[0], function)
 
 
 # Largest size of a small tensor. On a CPU, calling an operation on a small tensor takes longer than the arithmetic.
