@@ -85,7 +85,7 @@ def start(tmp_path):
         parquet.write_table(table(drawn).add_column(0, "id", rows), tmp_path / "in" / f"{i}.parquet")
     paths = os.pathsep.join([str(tmp_path), str(EXAMPLES), os.environ.get("PYTHONPATH", "")])
     variables = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "RAY_USAGE_STATS_ENABLED": "0"}
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "in"), str(tmp_path / "out")]
+    command = [sys.executable, "-c", SCRIPT, "in", "out"]  # Ray's checkpoints need absolute paths
     processes = []
 
     def run(*more):

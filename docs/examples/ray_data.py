@@ -9,6 +9,7 @@ command then goes on where it was stopped. Without ``--id``, OUT must not exist.
 """
 
 import argparse
+import os
 
 import ray
 from ray.data import ActorPoolStrategy, DataContext, SaveMode
@@ -32,6 +33,7 @@ def solve(
     function: type[Solve] = Solve,
 ) -> None:
     """Solve problems of Parquet files, with the options of the command; ``function`` is the class of the workers."""
+    source, out = (place if "://" in place else os.path.abspath(place) for place in (source, out))
     context = DataContext.get_current()
     context.target_max_block_size = BLOCK
     if id_column:
