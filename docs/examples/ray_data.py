@@ -33,12 +33,11 @@ def solve(
     function: type[Solve] = Solve,
 ) -> None:
     """Solve problems of Parquet files, with the options of the command; ``function`` is the class of the workers."""
-    source, out = (place if "://" in place else os.path.abspath(place) for place in (source, out))
     context = DataContext.get_current()
     context.target_max_block_size = BLOCK
     if id_column:
-        done = CheckpointConfig(id_column, f"{out.rstrip('/')}.done", delete_checkpoint_on_success=False)
-        context.checkpoint_config = done
+        place = out.rstrip("/") if "://" in out else os.path.abspath(out)  # a checkpoint takes no relative path
+        context.checkpoint_config = CheckpointConfig(id_column, f"{place}.done", delete_checkpoint_on_success=False)
     poses = ray.data.read_parquet(source).map_batches(
         function,
         fn_constructor_kwargs={"solver": solver},

@@ -43,7 +43,7 @@ _APART = 0.02
 # A given rival is tried only if the share of inliers is below this number.
 _CLEAR_OF_RIVALS = 0.97
 # Numbers of iterations of a rival: first with constant noise, then with estimated noise.
-_FROZEN, _FREE = 3, 5
+_FROZEN, _FREE = 1, 3
 # Number of iterations from each start in `find_alternatives`.
 _ITERATIONS = 12
 
