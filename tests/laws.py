@@ -242,7 +242,7 @@ def batches_are_free(case: Case) -> None:
 
 
 def shuffled_is_ordered(case: Case) -> None:
-    """The order of the pairs does not matter, except to samplers."""
+    """The order of the pairs does not matter."""
     call, _ = make(case)
     result = build(case)(**call)
     order = torch.randperm(call["world_points"].shape[1], generator=torch.Generator().manual_seed(0))
@@ -548,17 +548,15 @@ LAWS = (
 def applies(law: Callable[[Case], None], case: Case) -> bool:
     """Whether the contract promises the law to the solver.
 
-    Samplers see the places of the pairs. A first guess alone may come from a sample, which is a constant, and a network
-    of a fixed number of pairs makes nothing of fewer without a refinement.
+    A first guess alone may come from a sample, which is a constant, and a network of a fixed number of pairs makes
+    nothing of fewer without a refinement.
     """
     if law is isotropic_covariances_are_sigmas:
         return case.noise == "sigma"
     if case.solver in PEERS:
         return law not in NOT_OF_PEERS
-    if case.solver.startswith("net-"):
-        return law not in (gradients_reach_the_inputs, padding_is_nothing) and law not in OF_BELIEVED
-    samples = case.is_ransac or (case.focal == "unknown" and case.solver != "pnpnet-set")
-    return not (law is shuffled_is_ordered and samples)
+    of_networks = gradients_reach_the_inputs, padding_is_nothing, *OF_BELIEVED
+    return not (case.solver.startswith("net-") and law in of_networks)
 
 
 def gradcheck(case: Case) -> None:

@@ -80,7 +80,7 @@ _KEY = math.pi / 4
 LEAST_PROBABILITY = 0.955
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
 #: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.
-LAW = (-0.3296, 0.6574, -0.2317)
+LAW = (-0.3903, 0.6585, -0.2581)
 # Ranges to which the evidence and the logarithm of `pose_sigma` are clipped in :func:`probability`.
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
 #: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.

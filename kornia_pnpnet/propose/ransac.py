@@ -161,7 +161,7 @@ class RANSAC(Initialiser):
                 away = torch.where(fixed.weights > 0, fixed.img_points.abs().amax(-1), torch.nan)
                 wide = _GRID_RESIDUAL * fixed.free_focal.width * away.nanmedian(1).values.nan_to_num(0.0)
                 stages = [thresholds._replace(img=thresholds.img.maximum(wide[:, None])), thresholds]
-            search = Search(self, fixed, stages[0], _trusted(fixed))
+            search = Search(self, fixed, stages[0], _trusted(fixed), ranks=True)
             search.run(map_tensors(lambda x: x.detach()[:, None], given))
         projection, judged = self._refined(problems_last(problem), search.state, stages)
         pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
@@ -242,7 +242,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     thresholds = Thresholds(limit, torch.zeros_like(depth))
     chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
     given = map_tensors(lambda *x: torch.stack(x, 1), *constant.poses)
-    search = Search(_FURTHER, problem, thresholds, chances, sigma, finds_rivals=True)
+    search = Search(_FURTHER, problem, thresholds, chances, sigma, finds_rivals=True, ranks=True)
     drawn = search.run(given, enough=_FURTHER.min_samples)
     state, weights = search.state, constant.weights
     if len(drawn):

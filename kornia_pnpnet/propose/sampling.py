@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from kornia_pnpnet.core.performance import present_first
+from kornia_pnpnet.problem import Problem
 
-__all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "samples_needed", "spread_evenly"]
+__all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "ranked", "samples_needed", "spread_evenly"]
 
 # For each pair, _NEIGHBOURS nearest neighbours among at most _CANDIDATES pairs are compared, so that the cost is linear
 # in the number of pairs. _CANDIDATES is a power of two because of the bit masks.
@@ -24,11 +25,25 @@ _INFINITE = 0x7F800000
 _BLOCK = 2**18
 # Fractional parts of the multiples of the golden ratio are spread evenly over the unit interval.
 _GOLDEN = 0.6180339887
+# Pairs are ranked by u + _RANK[0] * v + _RANK[1] * d for a pixel (u, v) and the squared distance d of a point from the
+# origin. Different pairs rarely have the same sum.
+_RANK = 0.7548776662, 0.5698402910
 
 
 def kept_at_once(count: int, like: Tensor) -> int:
     """Number of items that are computed at once: ``count`` on a CPU, because of its caches, else 64 times ``count``."""
     return count if like.device.type == "cpu" else 64 * count
+
+
+@torch.no_grad()
+def ranked(problem: Problem, present: Tensor) -> Tensor:
+    """Positions (B, N) of the present pairs, before those of absent pairs, in an order that depends on the pairs alone.
+
+    A search of pairs in this order finds the same poses whatever the order of the caller.
+    """
+    u, v = problem.img_points.double().unbind(-1)  # in float32, rounding makes keys equal
+    keys = u + _RANK[0] * v + _RANK[1] * problem.world_points.square().sum(-1)
+    return torch.where(present, keys, torch.inf).argsort(stable=True)
 
 
 @torch.no_grad()

@@ -3,7 +3,7 @@ r"""The search of RANSAC: solve minimal samples, score their poses, and improve 
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from kornia_pnpnet.judge.inliers import Thresholds, judge, median_residual, resi
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.minimal import MinimalSolver
 from kornia_pnpnet.propose.p3p_rig import P3PRig
-from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once
+from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once, ranked
 from kornia_pnpnet.propose.scoring import Scene, Scorer, as_entries, as_pose
 from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, project
 from kornia_pnpnet.refine.terms import add_term
@@ -26,6 +26,8 @@ __all__ = ["CAUCHY", "Search", "cauchy_scale", "least_squares"]
 
 #: Scale of the Cauchy kernel in standard deviations.
 CAUCHY = 3.4
+
+_T = TypeVar("_T")
 
 # Poses are compared and improved in this dtype. At a focal length of 3400 px, rounding errors are about 1e-4 px.
 _DTYPE = torch.float32
@@ -50,7 +52,7 @@ _IMPROVED = 3
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
 # Square of the wider threshold at which rivals are scored, divided by the squared inlier threshold.
-_WIDER = 4.0
+_WIDER = 16.0
 # The entrywise product of a rotation and of the rotation after a Newton step sums to 3. If the sum for a matrix differs
 # from 3 by at least this number, the matrix is no rotation.
 _FAR_FROM_ROTATION = 0.1
@@ -94,6 +96,8 @@ class Search:
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`. If ``None``, the search
             estimates the standard deviation from the residuals of the inliers.
         finds_rivals: whether the search finds ``rivals``.
+        ranks: whether to search the pairs in the order :func:`~kornia_pnpnet.propose.sampling.ranked`, so that poses do
+            not depend on the order of the caller.
 
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
@@ -110,17 +114,24 @@ class Search:
         sigma: Tensor | None = None,
         *,
         finds_rivals: bool = False,
+        ranks: bool = False,
     ) -> None:
+        chances = (problem.weights > 0) * (torch.ones_like(problem.weights) if chances is None else chances)
+        if ranks:
+            order = ranked(problem, chances > 0)
+            of_pairs = problem.world_points, problem.img_points, problem.weights, problem.rig
+            of_pairs, chances, thresholds, sigma = _in_order((of_pairs, chances, thresholds, sigma), order)
+            world_points, img_points, weights, rig = of_pairs
+            problem = problem._replace(world_points=world_points, img_points=img_points, weights=weights, rig=rig)
         self.finds_rivals = finds_rivals
-        self.plan, self.problem = plan, problem
-        self.chances = (problem.weights > 0) * (torch.ones_like(problem.weights) if chances is None else chances)
+        self.plan, self.problem, self.chances = plan, problem, chances
         self.minimal = plan.minimal if problem.rig is None else P3PRig()
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, self.thresholds, _DTYPE)
         # All numbers of a pair are adjacent, (B, N, 6) or (B, N, 18) for rigs, so that one operation selects pairs.
-        rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
-        self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *rig), -1)
+        of_rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
+        self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *of_rig), -1)
         self.low = self.pairs.to(_DTYPE)
         batch = self.low.shape[0]
         self.poses = torch.eye(3, 4, dtype=_DTYPE, device=self.low.device).flatten().repeat(batch, 1)
@@ -343,6 +354,15 @@ class Search:
         """Improve poses (P, 12, K), and store the best pose of each problem."""
         if len(problems):
             self.loss[problems], self.poses[problems] = self._improved(problems, losses, poses)
+
+
+def _in_order(tree: _T, order: Tensor) -> _T:
+    """Take the pairs at positions (B, N) from tensors (B, N, ...). Tensors (B, 1) do not change."""
+
+    def take(x: Tensor) -> Tensor:
+        return x if x.shape[1] == 1 else x.take_along_dim(order.view(*order.shape, *(1,) * (x.ndim - 2)), 1)
+
+    return map_tensors(take, tree)
 
 
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:

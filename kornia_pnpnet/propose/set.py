@@ -19,7 +19,7 @@ from kornia_pnpnet.judge.evidence import copies
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.p3p import minimal_poses
-from kornia_pnpnet.propose.sampling import spread_evenly
+from kornia_pnpnet.propose.sampling import ranked, spread_evenly
 from kornia_pnpnet.propose.scoring import as_entries, as_pose
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO, project
 from kornia_pnpnet.result import Pose
@@ -356,7 +356,9 @@ class SetInit(Initialiser):
         given, index, starts = problem, None, self.starts
         same = _repeats(problem) if self.repeats else None
         if search_follows and problem.weights.shape[1] > _ENOUGH:
-            index = spread_evenly(problem.usual_weights > 0, _ENOUGH)
+            usual = problem.usual_weights > 0
+            order = ranked(problem, usual)
+            index = order.gather(1, spread_evenly(usual.gather(1, order), _ENOUGH))
             problem, same = _taken((problem, same), index)
         view = _View(problem, self.confidence, same)
         of_pairs, of_problem = (x.to(view.there.dtype) for x in self._run(view))

@@ -50,7 +50,9 @@ _T = TypeVar("_T")
 _MAX_RESIDUAL = 2.0
 # With `reject_worse`, a step is rejected only if the cost rises by more than this number of units in the last place.
 _ROUNDING = 100.0
-# Estimated noise of the points is replaced by 0 only if the log-likelihood then rises by more than this number.
+# Estimated noise of the points is replaced by 0 only if the log-likelihood then rises by more than this number. With 0
+# instead of 2, success with nine pairs of the protocol falls by 1.4 to 2.7 percentage points, and the errors with 20
+# exact points fall from 1.14 to 1.07 times those of least squares. Always without the noise: 4.6 to 5.3, 1.04 times.
 _EXPECTED = 2.0
 # Factors of the damping after a rejected step and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
