@@ -39,7 +39,7 @@ def kept_at_once(count: int, like: Tensor) -> int:
 def ranked(problem: Problem, present: Tensor) -> Tensor:
     """Positions (B, N) of the present pairs, before those of absent pairs, in an order that depends on the pairs alone.
 
-    A search of pairs in this order finds the same poses whatever the order of the caller.
+    If a search takes the pairs in this order, its poses do not depend on the order in which the caller gave the pairs.
     """
     u, v = problem.img_points.double().unbind(-1)  # in float32, rounding makes keys equal
     keys = u + _RANK[0] * v + _RANK[1] * problem.world_points.square().sum(-1)
