@@ -5,31 +5,22 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from kornia_pnpnet import Normalize, Pose, Problems
+from kornia_pnpnet import Pose, Problems
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.problem import Problem
 from kornia_pnpnet.refine.residual import retract
 
-if TYPE_CHECKING:
-    from kornia_pnpnet.training import FitReport
-
-
-#: Scripts that are no part of the package and import each other.
+# Scripts that are no part of the package and import each other.
 SCRIPTS = "benchmarks", "docs/results", "docs/examples"
 sys.path += [str(Path(__file__).resolve().parents[1] / folder) for folder in SCRIPTS]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _one_thread() -> None:
-    """The tensors are small: threads only get into each other's way, above all under pytest-xdist."""
-    torch.set_num_threads(1)
+# The tensors are small: threads only get into each other's way, above all under pytest-xdist.
+torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)
@@ -45,28 +36,9 @@ def generator() -> torch.Generator:
 
 @pytest.fixture
 def make_problems() -> Callable[..., Problems]:
-    def make(
-        n: int = 9,
-        batch: int = 7,
-        *,
-        outliers: int = 0,
-        noise: bool = True,
-        seed: int = 0,
-        dtype: torch.dtype = torch.float64,
-    ) -> Problems:
-        options = {"img_sigma": 1.0 * noise, "world_sigma": 0.05 * noise, "outliers": OutlierMix(count=outliers)}
-        return SyntheticProblems(n=n, batch_size=batch, seed=seed, dtype=dtype, **options).batch(0)
-
-    return make
-
-
-@pytest.fixture
-def correspond() -> Callable[[Problems], tuple[Problem, Pose]]:
-    """Problems in their own frame (centred, scaled, unordered), and the true poses in it."""
-
-    def make(problems: Problems) -> tuple[Problem, Pose]:
-        problem, frame = Normalize(order=False)(*problems[:3])
-        return problem, frame.apply(problems.pose)
+    def make(n: int = 9, batch: int = 7, *, outliers: int = 0, noise: bool = True, **options: Any) -> Problems:
+        options = {"img_sigma": 1.0 * noise, "world_sigma": 0.05 * noise, "dtype": torch.float64, **options}
+        return SyntheticProblems(n=n, batch_size=batch, outliers=OutlierMix(count=outliers), **options).batch(0)
 
     return make
 
@@ -100,13 +72,13 @@ def perturb() -> Callable[..., Pose]:
 
 
 @pytest.fixture
-def fit_config(tmp_path: Path) -> Callable[..., FitReport]:
+def fit_config(tmp_path: Path) -> Callable[..., Any]:
     """Train what a composed configuration describes, as ``train.py`` does, or another solver in its place."""
     from hydra.utils import instantiate
 
     from kornia_pnpnet.training import fit
 
-    def run(config: Any, solver: torch.nn.Module | None = None) -> FitReport:
+    def run(config: Any, solver: torch.nn.Module | None = None) -> Any:
         return fit(
             instantiate(config.model.solver) if solver is None else solver,
             instantiate(config.data.train),

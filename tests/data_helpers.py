@@ -52,8 +52,7 @@ def same(one, two):
 
 def arrays(problems):
     """The arrays of a shard."""
-    names = "world_points", "img_points", "intrinsics"
-    return {name: getattr(problems, name).numpy() for name in names}
+    return {name: getattr(problems, name).numpy() for name in ("world_points", "img_points", "intrinsics")}
 
 
 def table(problems, **more):
@@ -74,7 +73,7 @@ def pose_of(i):
     return quaternion, rotation, np.array([0.3 * i, -0.2, 0.5])
 
 
-def make_view(name="a.jpg", count=30, seed=0, inliers=None):
+def make_view(name="a.jpg", count=30, seed=0):
     """A view whose observations are exact. All its pixels differ."""
     rng = np.random.default_rng(seed)
     _, rotation, translation = pose_of(seed)
@@ -89,12 +88,12 @@ def make_view(name="a.jpg", count=30, seed=0, inliers=None):
         translation=torch.tensor(translation),
         width=WIDTH,
         height=HEIGHT,
-        inliers=torch.ones(count, dtype=torch.bool) if inliers is None else inliers,
+        inliers=torch.ones(count, dtype=torch.bool),
     )
 
 
-def make_scene(*counts, metric=True):
-    return Scene("toy", tuple(make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)), (), metric)
+def make_scene(*counts):
+    return Scene("toy", tuple(make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)), ())
 
 
 def match_arrays(*counts):

@@ -64,10 +64,8 @@ def verified_derivative(function: Callable[[State], Tensor], state: State) -> Te
     return jacobian
 
 
-def verify_jacobian(
-    function: Callable[[State], Tensor], state: State, analytic: Tensor, tolerance: float = 1e-9
-) -> None:
+def verify_jacobian(function: Callable[[State], Tensor], state: State, analytic: Tensor) -> None:
     """Check that ``analytic`` (B, M, 6 + K) is the derivative of a function (B, M) of states."""
     expected = verified_derivative(function, state)
     longest = expected.abs().amax((0, 1)).clamp(min=1e-3)
-    assert ((analytic - expected) / longest).abs().max() < tolerance
+    assert ((analytic - expected) / longest).abs().max() < 1e-9

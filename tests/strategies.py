@@ -1,10 +1,9 @@
-"""What the fuzz tests draw: options, damaged files and results; and what numbers of every result are."""
+"""What the fuzz tests draw: values of options, damaged files and results; and what numbers of every result are."""
 
 import contextlib
 import io
 import json
 import os
-from collections import Counter
 
 import torch
 from hypothesis import HealthCheck, settings
@@ -44,8 +43,6 @@ def are_rotations(matrices):
 #: Numbers for options: sound ones, and those that make no sense.
 ANY = st.one_of(st.floats(-2.0, 200.0), st.sampled_from([0, 1, -1, 0.0, 1e-6, 1e6, INF, -INF, NAN]))
 COUNTS = st.one_of(st.integers(-2, 12), st.sampled_from([0.5, NAN, True]))
-RANGES = st.tuples(ANY, ANY)
-BOOL = st.booleans()
 # Without a slash, which would make a word the name of a repository on the Hub.
 TEXT = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), max_size=12)
 OPTIONS = ["fixed", "adaptive", "unknown", "always"]
@@ -54,37 +51,7 @@ WORD = TEXT | st.sampled_from(OPTIONS)
 ARGUMENTS = ["800,800,320,240", "epnp", "p3p-ransac:threshold=2", "pnpnet-set:m=", "epnp:1", "nan", "-1", "--x"]
 WORDS = TEXT | st.sampled_from(ARGUMENTS)
 
-
-@st.composite
-def options(draw, **values):
-    """None, one or two of these options; the others stay as they are."""
-    names = draw(st.lists(st.sampled_from(sorted(values)), max_size=2, unique=True))
-    return {name: draw(values[name]) for name in names}
-
-
-class Seen:
-    """Counts what could be made and what was refused."""
-
-    def __init__(self):
-        self.counts = Counter()
-
-    def __call__(self, make, errors=ERRORS):
-        """What was made, or ``None``."""
-        try:
-            made = make()
-        except errors:
-            self.counts["refused"] += 1
-            return None
-        self.counts["works"] += 1
-        return made
-
-    def both(self, least=3):
-        """The cases held options that work and options that are refused."""
-        assert min(self.counts[x] for x in ("works", "refused")) >= least
-
-
-# --- files and the command --------------------------------------------------------------------------------------------
-
+#: What damage puts into a file.
 TOKENS = (*b',|\n|\r|"|\0|\xff|nan|inf|-|1e999|;| |PK\x03\x04'.split(b"|"), b"9" * 400)
 
 

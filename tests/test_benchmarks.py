@@ -22,19 +22,16 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
+PEERS = ("cv2", "poselib", "pycolmap")
 NAMES = ("contenders", "gpu", "harness", "page", "performance", "process", "solvers")
 contenders, gpu, harness, page, performance, process, benchmark = (importlib.import_module(name) for name in NAMES)
 
 
-@pytest.fixture
-def script(request):
-    """The script that the test's parameter ``name`` names, and the packages of its peers are there."""
-    for module in ("cv2", "poselib", "pycolmap"):
-        pytest.importorskip(module)
-    return importlib.import_module(request.param)
-
-
-# -- measure.sh --------------------------------------------------------------------------------------------------------
+def load(script, *packages):
+    """A script, if the packages that it needs are there."""
+    for package in packages:
+        pytest.importorskip(package)
+    return importlib.import_module(script)
 
 
 def test_everything_is_measured_once_at_a_commit(tmp_path):
@@ -69,12 +66,8 @@ def test_everything_is_measured_once_at_a_commit(tmp_path):
     assert scripts("nothing") == stopped + rest[1:]
 
 
-# -- solvers.py --------------------------------------------------------------------------------------------------------
-
-
 def test_every_solver_has_a_row_for_every_set_it_solves(tmp_path):
-    for module in ("cv2", "poselib"):
-        pytest.importorskip(module)
+    load("solvers", "cv2", "poselib")
     path, sizes = tmp_path / "solvers.json", ("--count", "20", "--repeats", "3", "--memory-count", "0")
     benchmark.main(["--out", str(path), *sizes, "--solvers", *SOLVERS])
     written = json.loads(path.read_text())
@@ -111,18 +104,11 @@ def test_missing_packages_are_skipped_with_a_reason(monkeypatch):
     assert results["memory"] == []
 
 
-# -- contenders --------------------------------------------------------------------------------------------------------
-
-
 # Exporting takes minutes.
-EAGER = [
-    pytest.param(name, marks=pytest.mark.slow) if name.endswith(("ONNX", "packaged")) else name
-    for name in contenders.CONTENDERS
-    if "compiled" not in name
-]
+MARKS = {x: [pytest.mark.slow] * x.endswith(("ONNX", "packaged")) for x in contenders.CONTENDERS if "compiled" not in x}
 
 
-@pytest.mark.parametrize("name", EAGER)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks) for name, marks in MARKS.items()])
 def test_contenders_solve_and_differentiate(name, make_problems):
     """Without noise and outliers every contender finds the pose; gradients, where there are any, are finite."""
     try:
@@ -134,12 +120,11 @@ def test_contenders_solve_and_differentiate(name, make_problems):
     assert task.seconds(2) > 0
     if contender.differentiable:
         problems = make_problems(n=9, batch=3)
-        points, pixels, *learned = contender.task(problems, backward=True).call()
-        assert points.shape == problems.world_points.shape
-        assert pixels.shape == problems.img_points.shape
-        assert all(gradient.isfinite().all() for gradient in (points, pixels, *learned) if gradient is not None)
-        assert points.abs().sum() > 0
-        assert pixels.abs().sum() > 0
+        gradients = contender.task(problems, backward=True).call()  # to points, pixels and parameters
+        assert all(gradient.isfinite().all() for gradient in gradients if gradient is not None)
+        for gradient, leaf in zip(gradients[:2], problems[:2], strict=True):
+            assert gradient.shape == leaf.shape
+            assert gradient.any()
 
 
 def test_a_solver_that_does_not_compile_is_not_timed_as_compiled(monkeypatch):
@@ -151,15 +136,11 @@ def test_a_solver_that_does_not_compile_is_not_timed_as_compiled(monkeypatch):
         contenders.compile_or_raise(nn.Linear(1, 1))
 
 
-# -- performance.py ----------------------------------------------------------------------------------------------------
-
-SMALL = ("refinement", "epnp-lm", "opencv-ransac", "kornia-dlt")
-
-
 @pytest.mark.slow
 def test_throughput_and_latency_have_a_row_for_every_point(tmp_path, monkeypatch):
     """A small run, in one process instead of many."""
     pytest.importorskip("cv2")
+    names = ("refinement", "epnp-lm", "opencv-ransac", "kornia-dlt")
 
     def here(script, *arguments, **environment):
         request = json.loads(arguments[-1])
@@ -169,18 +150,18 @@ def test_throughput_and_latency_have_a_row_for_every_point(tmp_path, monkeypatch
         return json.loads(json.dumps(performance.measure_threads(request["part"], settings, request["count"])))
 
     monkeypatch.setattr(performance, "run_child", here)
-    performance.main(["measure", "--quick", "--contenders", *SMALL, "--results", str(tmp_path)])
+    performance.main(["measure", "--quick", "--contenders", *names, "--results", str(tmp_path)])
     throughput, latency = (page.load_parts(tmp_path)[0][part] for part in ("throughput", "latency"))
     rows = {(row["contender"], row["threads"], row["mode"], row["n"], row["batch"]) for row in throughput["rows"]}
     small, large = performance.QUICK.batches
     forward = [(1, "forward", 6, performance.QUICK.problems), (2, "forward", 9, large)]
     forward += [(1, "forward", 9, batch) for batch in (small, large)]
     backward = [(threads, "forward+backward", 9, batch) for threads, batch in ((1, small), (1, large), (2, large))]
-    expected = {(name, *point) for name in SMALL for point in forward}
-    assert rows == expected | {(name, *point) for name in SMALL if name != "opencv-ransac" for point in backward}
+    expected = {(name, *point) for name in names for point in forward}
+    assert rows == expected | {(name, *point) for name in names if name != "opencv-ransac" for point in backward}
     assert all(1 <= row["count"] <= row["batch"] for row in throughput["rows"])
     assert throughput["skipped"] == []
-    assert [(row["contender"], row["threads"]) for row in latency["rows"]] == [(n, t) for t in (1, 2) for n in SMALL]
+    assert [(row["contender"], row["threads"]) for row in latency["rows"]] == [(n, t) for t in (1, 2) for n in names]
     for row in latency["rows"]:
         spread = row["quantiles_us"]
         assert spread == sorted(spread)
@@ -204,9 +185,6 @@ def test_a_large_call_shows_in_the_memory_of_its_process():
     assert min(found["torch_s"], found["package_s"], found["make_s"]) > 0
 
 
-# -- gpu.py ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
     pytest.importorskip("cv2")
@@ -216,8 +194,7 @@ def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
     path = tmp_path / "gpu.json"
     to_file = ["--device", "cpu", "--out", str(path)]
     gpu.main(to_file, few)
-    written = json.loads(path.read_text())
-    results = {part: found["rows"] for part, found in written.items()}
+    results = {part: found["rows"] for part, found in json.loads(path.read_text()).items()}
     assert {"pnpnet-n9", "pnpnet-set", "p3p-ransac", "epnp"} <= {row["solver"] for row in results["parity"]}
     for row in results["parity"]:  # the device is the CPU
         assert row["same_ok"] == 1.0
@@ -234,11 +211,8 @@ def test_the_measurements_for_a_gpu_run_on_a_cpu(tmp_path, monkeypatch):
     assert json.loads(path.read_text())["throughput"]["rows"] == results["throughput"]
 
 
-# -- uncertainty.py and cameras.py -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("script", ["uncertainty"], indirect=True)
-def test_covariances_are_right_and_bring_errors_close_to_the_bound(script, monkeypatch):
+def test_covariances_are_right_and_bring_errors_close_to_the_bound(monkeypatch):
+    script = load("uncertainty", *PEERS)
     for name, value in (("SIZES", (30,)), ("SHARES", (0.3,)), ("CREDIBLE", ((20, 0), (50, 25)))):
         monkeypatch.setattr(script, name, value)
     solver = create_solver(script.SOLVER).double()
@@ -250,8 +224,8 @@ def test_covariances_are_right_and_bring_errors_close_to_the_bound(script, monke
         assert 0.935 < row["below"] < 0.97, row
 
 
-@pytest.mark.parametrize("script", ["cameras"], indirect=True)
-def test_cameras_are_measured_beside_the_peers(script, monkeypatch):
+def test_cameras_are_measured_beside_the_peers(monkeypatch):
+    script = load("cameras", *PEERS)
     for name, value in (("RIGS", (3,)), ("BASELINES", (0.1,)), ("FEW", 8)):
         monkeypatch.setattr(script, name, value)
     found = {row["solver"]: row for row in script.measure_focal(32, (12,), (0.25,))}
@@ -262,22 +236,16 @@ def test_cameras_are_measured_beside_the_peers(script, monkeypatch):
     assert all(row["median_focal"] < 0.01 for row in script.measure_cell(4, 100))
 
 
-# -- the pages ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("script", ["cameras", "solvers", "uncertainty"], indirect=True)
-def test_pages_are_written_from_their_files(script):
-    results = json.loads((FOLDER / f"{script.__name__}.json").read_text())
-    assert script.page(results) == (FOLDER / f"{script.__name__}.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["cameras", "solvers", "uncertainty"])
+def test_pages_are_written_from_their_files(name):
+    results = json.loads((FOLDER / f"{name}.json").read_text())
+    assert load(name, *PEERS).page(results) == (FOLDER / f"{name}.md").read_text(encoding="utf-8")
 
 
 def test_the_page_of_performance_is_written_from_its_files():
     results, on_gpu = page.load_parts(FOLDER)
     assert page.page(results, on_gpu) == page.PAGE.read_text(encoding="utf-8")
     assert "Not measured" in page.page(results)
-
-
-# -- real_matches.py ---------------------------------------------------------------------------------------------------
 
 
 def write_matches(path, seed):
@@ -294,18 +262,15 @@ def write_matches(path, seed):
 
 
 def test_real_matches_are_measured_and_failures_drawn(tmp_path):
-    pytest.importorskip("pandas")
-    pytest.importorskip("poselib")
-    real_matches = importlib.import_module("real_matches")
+    real_matches = load("real_matches", "pandas", "poselib")
     files = [tmp_path / f"{name}.npz" for name in ("yard", "room")]
     for seed, file in enumerate(files):
         write_matches(file, seed)
     specs = ["p3p-ransac:max_samples=3", "p3p-ransac:threshold=8", "p3p-ransac:threshold=8+ratio", "known-inliers"]
     specs += ["poselib:threshold=8+ratio", "pnpnet-set+sigma"]
-    out = tmp_path / "out.json"
     more = ["--split", "made up", "--pictures", tmp_path, "--batch", 500, 1, "--solvers", *specs]
-    real_matches.main([str(x) for x in ("measure", *files, "--out", out, *more)])
-    results = json.loads(out.read_text())
+    real_matches.main([str(x) for x in ("measure", *files, "--out", tmp_path / "out.json", *more)])
+    results = json.loads((tmp_path / "out.json").read_text())
     rows = {(row["solver"], row["kind"], row["group"], row["batch"]): row for row in results["rows"]}
     for kind, spec in itertools.product(real_matches.KINDS, specs):
         every = rows[spec, kind, "all", 500]
@@ -319,13 +284,8 @@ def test_real_matches_are_measured_and_failures_drawn(tmp_path):
     assert all((tmp_path / failure["picture"]).stat().st_size > 0 for failure in results["failures"])
 
 
-# -- keypoints.py ------------------------------------------------------------------------------------------------------
-
-
 def test_keypoints_are_measured_where_they_were_not_seen(tmp_path, monkeypatch):
-    pytest.importorskip("poselib")
-    pytest.importorskip("sklearn")
-    keypoints = importlib.import_module("keypoints")
+    keypoints = load("keypoints", "poselib", "sklearn")
     p, draw = SyntheticProblems(n=12, batch_size=60, seed=3, dtype=torch.float64).batch(0), np.random.default_rng(0)
     confidence = draw.uniform(0.2, 1.0, (60, 12))
     pixels = p.img_points.numpy() + 2.0 / confidence[..., None] * draw.normal(size=(60, 12, 2))
@@ -335,9 +295,8 @@ def test_keypoints_are_measured_where_they_were_not_seen(tmp_path, monkeypatch):
     arrays |= {"R": p.pose.rotation, "t": p.pose.translation, "mask": np.ones((60, 12), bool)}
     np.savez(tmp_path / "a.npz", **arrays, seen=np.arange(60) < 30, cluster=np.arange(60) // 2, inlier_px=40.0)
     (tmp_path / "sources.json").write_text('{"a": "synthetic"}')
-    files = ("a.npz", "--sources", "sources.json", "--out", "out.json")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["keypoints.py", *files])
+    monkeypatch.setattr(sys, "argv", ["keypoints.py", "a.npz", "--sources", "sources.json", "--out", "out.json"])
     keypoints.main()
     (result,) = json.loads(Path("out.json").read_text())["results"]
     assert (result["seen"], result["measured"], result["clusters"]) == (30, 30, 15)

@@ -9,15 +9,15 @@ from kornia.core.exceptions import BaseError
 from kornia.geometry.calibration import distort_points, undistort_points
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, convert_points_to_homogeneous
 from kornia.geometry.linalg import inverse_transformation, transform_points
+from laws import distorted
 from torch.nn import functional
 
-from kornia_pnpnet import PnPNet, Pose, create_solver, monte_carlo_pose_loss, pose_covariance, solve_pnp
+from kornia_pnpnet import PnPNet, Pose, create_solver, monte_carlo_pose_loss, pose_covariance, pose_errors, solve_pnp
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.losses import SetLoss
-from kornia_pnpnet.metrics import pose_errors
 from kornia_pnpnet.problem import Noise
 
 #: Coefficients of Kornia and OpenCV; the models take the first 4, 5, 8, 12 or 14.
@@ -25,42 +25,24 @@ DIST = torch.tensor(
     [-0.2, 0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002, 0.001, -0.001, 0.002, 0.0005, 0.01, -0.02], dtype=torch.float64
 )
 FISHEYE = torch.tensor([0.05, -0.01, 0.002, -0.0005], dtype=torch.float64)
+LENSES = {"dist": DIST[:5], "fisheye": FISHEYE}
 CAMERA = torch.tensor([[400.0, 0.0, 320.0], [0.0, 420.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 @pytest.fixture
-def uniform():
-    generator = torch.Generator().manual_seed(0)
+def uniform(generator):
     return lambda *shape, low=-1.0, high=1.0: (
         low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
     )
-
-
-def poses(uniform, batch):
-    return Pose(axis_angle_to_rotation_matrix(uniform(batch, 3)), 2.0 * uniform(batch, 3))
-
-
-def to_world(cam_points, pose):
-    return transform_points(inverse_transformation(pose.matrix), cam_points)
 
 
 def seen(uniform, batch, n):
     """World points, undistorted pixels and poses of the camera."""
     pixels = torch.stack((uniform(batch, n, low=20, high=620), uniform(batch, n, low=20, high=460)), -1)
     rays = convert_points_to_homogeneous(pixels) @ torch.linalg.inv(CAMERA).mT
-    pose = poses(uniform, batch)
-    return to_world(rays * uniform(batch, n, 1, low=3.0, high=7.0), pose), pixels, pose
-
-
-def distort(pixels, lens):
-    """Pixels of a lens, by Kornia or OpenCV, and the arguments of a call."""
-    if lens == "dist":
-        return distort_points(pixels, CAMERA.expand(len(pixels), 3, 3), DIST[:5].expand(len(pixels), -1)), {
-            "dist": DIST[:5]
-        }
-    plane = transform_points(torch.linalg.inv(CAMERA), pixels).reshape(-1, 1, 2).numpy()
-    distorted = cv2.fisheye.distortPoints(plane, CAMERA.numpy(), FISHEYE.numpy())
-    return torch.from_numpy(distorted).reshape_as(pixels), {"fisheye": FISHEYE}
+    pose = Pose(axis_angle_to_rotation_matrix(uniform(batch, 3)), 2.0 * uniform(batch, 3))
+    points = transform_points(inverse_transformation(pose.matrix), rays * uniform(batch, n, 1, low=3.0, high=7.0))
+    return points, pixels, pose
 
 
 def right(result, pose, degrees=0.01, shift=0.001):
@@ -73,45 +55,45 @@ def test_undistorted_pixels_are_distorted_back_and_kornias(number, uniform):
     """Kornia's fixed-point iteration has the same limit where the distortion is mild."""
     _, pixels, _ = seen(uniform, 3, 50)
     camera, dist = CAMERA.expand(3, 3, 3), DIST[:number].expand(3, -1)
-    distorted = distort_points(pixels, camera, dist)
-    found, there, _ = undistort(distorted, camera, dist, None, None)
+    seen_pixels = distort_points(pixels, camera, dist)
+    found, there, _ = undistort(seen_pixels, camera, dist, None, None)
     assert there.all()
     torch.testing.assert_close(found, pixels, rtol=0, atol=1e-8)
-    torch.testing.assert_close(found, undistort_points(distorted, camera, dist, num_iters=200), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found, undistort_points(seen_pixels, camera, dist, num_iters=200), rtol=0, atol=1e-6)
 
 
 def test_fisheyes_agree_with_opencv(uniform):
     """Pixels in the plane, and directions beyond it."""
     _, pixels, _ = seen(uniform, 1, 50)
-    distorted, _ = distort(pixels, "fisheye")
-    found, there, _ = undistort(distorted, CAMERA[None], None, FISHEYE[None], None)
+    plane = transform_points(torch.linalg.inv(CAMERA), pixels).reshape(-1, 1, 2).numpy()
+    seen_pixels = torch.from_numpy(cv2.fisheye.distortPoints(plane, CAMERA.numpy(), FISHEYE.numpy())).view(1, 50, 2)
+    found, there, _ = undistort(seen_pixels, CAMERA[None], None, FISHEYE[None], None)
     assert there.all()
     torch.testing.assert_close(found, pixels, rtol=0, atol=1e-6)
-    rays = bearings(distorted, CAMERA, fisheye=FISHEYE) @ CAMERA.mT
+    rays = bearings(seen_pixels, CAMERA, fisheye=FISHEYE) @ CAMERA.mT
     torch.testing.assert_close(rays[..., :2] / rays[..., 2:], pixels, rtol=0, atol=1e-6)
 
 
 def test_where_there_is_no_pixel():
     """Beyond the turning point of a polynomial, and beside a pinhole camera's plane."""
-    far = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * 0.9, 240.0]]], dtype=torch.float64)
-    wide = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * 2.0, 240.0]]], dtype=torch.float64)  # 115 degrees
     turning = torch.tensor([[-0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    for pixels, dist, fisheye in ((far, turning, None), (wide, None, 0.0 * turning)):
+    for off, dist, fisheye in ((0.9, turning, None), (2.0, None, 0.0 * turning)):  # 2 radians are 115 degrees
+        pixels = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * off, 240.0]]], dtype=torch.float64)
         _, there, _ = undistort(pixels, CAMERA[None], dist, fisheye, None)
         assert there.tolist() == [[True, False]]
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm"])
-@pytest.mark.parametrize("lens", ["dist", "fisheye"])
+@pytest.mark.parametrize("lens", LENSES)
 def test_distorted_pixels_are_solved_without_those_that_no_point_has(name, lens, uniform):
     points, pixels, pose = seen(uniform, 8, 12)
-    distorted, given = distort(pixels, lens)
-    distorted[:, 0] = 5000.0
-    solver = create_solver(name)
-    of_each = solver(points, distorted, CAMERA, **{lens: given[lens].expand(8, -1)})
+    given, solver = {lens: LENSES[lens].expand(8, -1)}, create_solver(name)
+    pixels = distorted(pixels, CAMERA.expand(8, 3, 3), **given)
+    pixels[:, 0] = 5000.0
+    of_each = solver(points, pixels, CAMERA, **given)
     assert right(of_each, pose, 0.1, 0.01).all()
     assert (of_each.weights[:, 0] == 0).all()
-    matrices = solve_pnp(points, distorted, CAMERA, solver=solver, **given)
+    matrices = solve_pnp(points, pixels, CAMERA, solver=solver, **{lens: LENSES[lens]})
     torch.testing.assert_close(matrices, of_each.matrix[:, :3])
 
 
@@ -124,8 +106,7 @@ def test_the_noise_goes_through_the_lens(uniform):
     jacobian = torch.stack([(ahead - back) / 2e-4 for ahead, back in moved], -1)
     cov = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
     one = torch.ones(2, 9, dtype=torch.float64)
-    noise = Noise(one, one, Symmetric2.of(cov.expand(2, 9, 2, 2)))
-    _, _, found = undistort(pixels, camera, dist, None, noise)
+    _, _, found = undistort(pixels, camera, dist, None, Noise(one, one, Symmetric2.of(cov.expand(2, 9, 2, 2))))
     expected = Symmetric2.of(jacobian @ cov @ jacobian.mT)
     torch.testing.assert_close(tuple(found.img_cov), tuple(expected), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.img, (0.5 * jacobian.square().sum((-1, -2))).sqrt(), rtol=1e-5, atol=1e-6)
@@ -150,7 +131,7 @@ def test_covariances_and_losses_of_negative_focal_lengths(signs, make_problems):
     torch.testing.assert_close(*outcomes, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("lens", ["dist", "fisheye"])
+@pytest.mark.parametrize("lens", LENSES)
 def test_gradcheck_of_the_lens(lens, uniform):
     _, pixels, _ = seen(uniform, 1, 4)
     given = (DIST[:8] if lens == "dist" else FISHEYE)[None]
@@ -180,10 +161,10 @@ def test_bearing_cameras_look_along(uniform):
 def everywhere(uniform, batch, n, outliers=0):
     """Points all around, bearings and poses; the first bearings are outliers."""
     cam_points = functional.normalize(uniform(batch, n, 3), dim=-1) * uniform(batch, n, 1, low=3.0, high=7.0)
-    pose = poses(uniform, batch)
+    pose = Pose(axis_angle_to_rotation_matrix(uniform(batch, 3)), 2.0 * uniform(batch, 3))
     rays = functional.normalize(cam_points, dim=-1)
     rays[:, :outliers] = functional.normalize(uniform(batch, outliers, 3), dim=-1)
-    return to_world(cam_points, pose), rays, pose
+    return transform_points(inverse_transformation(pose.matrix), cam_points), rays, pose
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm"])

@@ -32,33 +32,28 @@ def problem_file(kind):
     return file.getvalue(), kind.split()[-1]
 
 
-def solving(kind, path):
-    """The arguments that solve a file."""
-    shard = "--batch", "--out", path.parent / "out", "--overwrite"
-    options = shard if kind.startswith("shard") else ("--intrinsics", "3400,3400,0,0")
-    return "solve", path, *options, "--solver", "epnp"
-
-
 @pytest.mark.filterwarnings("ignore")  # of NumPy, about headers and overlapping entries
 @pytest.mark.parametrize("kind", ["csv", "npz", "shard npz", "shard parquet"])
 def test_damaged_files_are_a_line_and_no_traceback(kind, tmp_path):
     sound, suffix = problem_file(kind)
+    path, shard = tmp_path / f"problem.{suffix}", ("--batch", "--out", tmp_path / "out", "--overwrite")
+    options = shard if kind.startswith("shard") else ("--intrinsics", "3400,3400,0,0")
+
+    def solve(content):
+        path.write_bytes(content)
+        return run_main("solve", path, *options, "--solver", "epnp")
 
     @many(150)
     @given(damage(sound))
     def check_file(content):
-        path = tmp_path / f"problem.{suffix}"
-        path.write_bytes(content)
-        code, out, err = run_main(*solving(kind, path))
+        code, out, err = solve(content)
         assert code in (0, 1, 2)
         if code == 2:
             assert err.startswith(f"pnpnet: {path}")
         elif not kind.startswith("shard"):
             assert json.loads(out)["n"] >= 3
 
-    path = tmp_path / f"sound.{suffix}"
-    path.write_bytes(sound)
-    assert run_main(*solving(kind, path))[0] == 0
+    assert solve(sound)[0] == 0
     check_file()
 
 

@@ -15,7 +15,7 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.torch_version import TorchVersion
 
-from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, create_solver
+from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
 from kornia_pnpnet.core.performance import INLINE, Runner, ascending_order, in_order, in_turn, ranked
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 
@@ -29,11 +29,7 @@ def backend(monkeypatch):
     torch.compiler.reset()
     counter = CompileCounter()
     compile_ = torch.compile
-
-    def capture(function, **options):
-        return compile_(function, **{**options, "options": None, "backend": counter})
-
-    monkeypatch.setattr(torch, "compile", capture)
+    monkeypatch.setattr(torch, "compile", lambda function, options, **x: compile_(function, backend=counter, **x))
     yield counter
     torch.compiler.reset()
 
@@ -44,36 +40,31 @@ def problems(count, n=9, dtype=torch.float64):
 
 def assert_compiled_is_eager(solver, compiled, batch, rtol=1e-6, atol=1e-6, gradients=False):
     """Two solvers have the same results and, on request, the same gradients."""
-    results, derivatives = [], []
-    for net in (solver, compiled):
+
+    def solve(net):
         inputs = [x.clone().requires_grad_(gradients) for x in batch[:3]]
         with torch.set_grad_enabled(gradients):
             result = net(*inputs, cam_from_rig=batch.cam_from_rig)
-        results.append(result)
-        if gradients:
-            total = sum(x.sum() for x in (result.rotation, result.weights, result.cost, result.init.translation))
-            derivatives.append(torch.autograd.grad(total, [*inputs, *net.parameters()], materialize_grads=True))
-            assert derivatives[-1][0].any()
-    assert_same(*results[::-1], rtol=rtol, atol=atol)
-    if gradients:
-        assert_same(*derivatives[::-1], rtol=1e-4, atol=atol)
+        if not gradients:
+            return result, ()
+        total = sum(x.sum() for x in (result.rotation, result.weights, result.cost, result.init.translation))
+        return result, torch.autograd.grad(total, [*inputs, *net.parameters()], materialize_grads=True)
+
+    (expected, derivatives), (found, compiled_derivatives) = solve(solver), solve(compiled)
+    assert not gradients or derivatives[0].any()
+    assert_same(found, expected, rtol=rtol, atol=atol)
+    assert_same(compiled_derivatives, derivatives, rtol=1e-4, atol=atol)
+
+
+QUICK = [("pnpnet-n9", 2, False, 1, False), ("pnpnet-n9", 2, True, 1, True)]
+SLOW = [("pnpnet-n9", 3, True, 1, False), ("pnpnet-n9", 1, False, 1, True)]
+SLOW += [(name, 1, False, 1, False) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "pnpnet-set")]
+SLOW += [("pnpnet-set", 1, whole, 3, False) for whole in (False, True)]
 
 
 @pytest.mark.parametrize(
     ("name", "views", "whole", "cameras", "gradients"),
-    [
-        ("pnpnet-n9", 2, False, 1, False),
-        ("pnpnet-n9", 2, True, 1, True),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                ("pnpnet-n9", 3, True, 1, False),
-                ("pnpnet-n9", 1, False, 1, True),
-                *((name, 1, False, 1, False) for name in ("pnpnet-n9", "epnp-lm", "reppnp-lm", "pnpnet-set")),
-                *(("pnpnet-set", 1, whole, 3, False) for whole in (False, True)),
-            )
-        ),
-    ],
+    [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
 )
 def test_each_part_is_one_graph_and_the_batch_may_change(name, views, whole, cameras, gradients, backend):
     # The set's softmax and the search for rigs round otherwise in a graph, and some of their parts run on demand.
@@ -180,9 +171,8 @@ def test_copies_use_their_own_weights(backend):
 @pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])
 def test_nothing_reads_a_value_back(name):
     """So a solve can be captured as one CUDA graph: fake tensors have no values to branch on."""
-    solver = create_solver(name, effort="fixed")
+    solver = create_solver(name, effort="fixed").double()
     inputs = problems(3)[:3]
-    solver.double()
     with FakeTensorMode(allow_non_fake_inputs=True) as mode, torch.no_grad():
         result = solver(*(mode.from_tensor(x) for x in inputs))
     assert result.rotation.shape == (3, 3, 3)
@@ -199,14 +189,7 @@ def test_inductor_computes_the_same(whole):
     compiled.compile(whole=whole)
     for count in (50, 31, 1):
         assert_compiled_is_eager(solver, compiled, problems(count, n=6), atol=1e-8)
-    grads = []
-    for net in (solver, compiled):
-        inputs = [x.clone().requires_grad_() for x in problems(50, n=6)[:3]]
-        result = net(*inputs)
-        assert result.ok.any()
-        total = result.rotation.sum() + result.init.translation.sum()
-        grads.append(torch.autograd.grad(total, [*inputs, *net.parameters()]))
-    assert_same(*grads, rtol=1e-4, atol=1e-6)
+    assert_compiled_is_eager(solver, compiled, problems(50, n=6), gradients=True)
 
 
 @pytest.mark.slow
@@ -230,11 +213,9 @@ def test_inductor_computes_the_same_with_more_pairs_than_problems():
     compiled = copy.deepcopy(solver)
     compiled.compile()
     for count in (20, 50):
-        batch = problems(count, n=40)
-        inputs = [x.float() for x in batch[:3]]
-        start = Pose(*(x.float() for x in batch.pose))
+        batch = problems(count, n=40, dtype=torch.float32)
         with torch.no_grad():
-            ours, eager = compiled(*inputs, init=start), solver(*inputs, init=start)
+            ours, eager = (net(*batch[:3], init=batch.pose) for net in (compiled, solver))
         torch.testing.assert_close(ours.matrix, eager.matrix, rtol=1e-3, atol=1e-3)
 
 
@@ -267,8 +248,6 @@ def test_ties_of_the_first_key_are_ordered_by_the_second_and_equal_pairs_stay(co
     for run in (Runner(), Runner(True)):
         assert run(ascending_order, keys).tolist() == expected
 
-
-# --- operations as elementwise operations, in packages of one problem -------------------------------------------------
 
 of_the_exporter = pytest.mark.filterwarnings("ignore::FutureWarning")  # about its own code
 

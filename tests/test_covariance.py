@@ -1,13 +1,23 @@
-"""The covariance of a pose against the pose errors of many noisy problems."""
+"""Covariances: of poses, against the errors of many noisy problems; of pixels and points, from argument to gradient."""
+
+import math
 
 import pytest
 import torch
+from helpers import assert_same, derivative, reprojection_errors
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from laws import PAIRS, Case, make, make_bad
-from torch.utils import _pytree as pytree
+from laws import PAIRS, Case, gradcheck_by_size, make, make_bad
 
-from kornia_pnpnet import PnPResult, Pose, PosePrior, create_solver, pose_covariance
+from kornia_pnpnet import PnPNet, PnPResult, Pose, PosePrior, RobustWeightedLM, create_solver, pose_covariance
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.likelihood import monte_carlo_pose_loss
+from kornia_pnpnet.metrics import pose_errors
+from kornia_pnpnet.problem import State
+from kornia_pnpnet.refine.residual import retract
+
+DOUBLE = torch.float64
+CAMERA = torch.tensor([[800.0, 30.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]], dtype=DOUBLE)
 
 
 def tangent(estimate, truth):
@@ -20,7 +30,7 @@ def test_zero_weight_equals_removing(make_problems):
     """Such pairs may hold any numbers."""
     p = make_problems(n=12, batch=5)
     weights = (torch.arange(12) < 8).double().expand(5, 12)
-    world, sigma = p.world_points.clone(), torch.full((5, 12), 2.0, dtype=torch.float64)
+    world, sigma = p.world_points.clone(), torch.full((5, 12), 2.0, dtype=DOUBLE)
     world[:, 8:], sigma[:, 8:] = torch.nan, torch.nan
     half = pose_covariance(p.pose, world, *p[1:3], img_sigma=sigma, weights=weights)
     part = pose_covariance(p.pose, p.world_points[:, :8], p.img_points[:, :8], p.intrinsics, img_sigma=2.0)
@@ -31,13 +41,12 @@ def test_units_of_the_noise(make_problems):
     """A number, one per problem or one per pair; twice the noise is four times the covariance."""
     p = make_problems(n=12, batch=5)
     plain = pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.1)
-    double = pose_covariance(
-        p.pose, *p[:3], img_sigma=p.world_points.new_full((5,), 2.0), world_sigma=p.world_points.new_full((5, 12), 0.2)
-    )
+    full = p.world_points.new_full
+    double = pose_covariance(p.pose, *p[:3], img_sigma=full((5,), 2.0), world_sigma=full((5, 12), 0.2))
     torch.testing.assert_close(double, 4.0 * plain)
     scaled = Pose(p.pose.rotation, 1000.0 * p.pose.translation)
     large = pose_covariance(scaled, 1000.0 * p.world_points, *p[1:3], img_sigma=1.0, world_sigma=100.0)
-    unit = torch.tensor([1.0] * 3 + [1000.0] * 3, dtype=torch.float64)
+    unit = torch.tensor([1.0] * 3 + [1000.0] * 3, dtype=DOUBLE)
     torch.testing.assert_close(large, plain * unit * unit[:, None])
 
 
@@ -51,7 +60,7 @@ def test_an_undetermined_pose_has_infinite_variances_and_no_gradient(noise):
     found, expected = pose_covariance(pose, **bad), pose_covariance(pose, **sound)
     assert torch.equal(found[::2], expected[::2])
     assert expected.isfinite().all()
-    infinite = torch.diag(torch.full((6,), torch.inf, dtype=torch.float64))
+    infinite = torch.diag(torch.full((6,), torch.inf, dtype=DOUBLE))
     assert torch.equal(found[1::2], infinite.expand(len(kinds), 6, 6)), kinds
     for gradient in torch.autograd.grad(found[::2].sum(), leaves):
         assert gradient.isfinite().all()
@@ -61,7 +70,7 @@ def test_an_undetermined_pose_has_infinite_variances_and_no_gradient(noise):
 @pytest.mark.parametrize(("n", "outliers"), [(12, 0), (20, 5)])
 def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
     """The mean normalised squared errors are those of chi-square: 6 for the pose, 3 for each half."""
-    data = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=outliers), dtype=torch.float64)
+    data = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=outliers), dtype=DOUBLE)
     p = data.batch(0)
     noise = {"img_sigma": 1.0, "world_sigma": 0.05}
     result = create_solver("pnpnet-set").double()(*p[:3], **noise)
@@ -75,10 +84,8 @@ def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
 @pytest.mark.parametrize(("n", "img_sigma", "world_sigma"), [(20, 1.0, 0.05), (50, 2.0, 0.0), (30, 0.0, 0.02)])
 def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sigma):
     """Whether the pixels or the points have noise, as :func:`pose_covariance` of the true noise within a third."""
-    data = SyntheticProblems(
-        n=n, batch_size=500, seed=10, img_sigma=img_sigma, world_sigma=world_sigma, dtype=torch.float64
-    )
-    p = data.batch(0)
+    options = {"n": n, "batch_size": 500, "seed": 10, "dtype": DOUBLE}
+    p = SyntheticProblems(img_sigma=img_sigma, world_sigma=world_sigma, **options).batch(0)
     result = create_solver("pnpnet-set").double()(*p[:3])
     covariance = result.covariance(*p[:3])
     error = tangent(result.pose, p.pose)[result.ok]
@@ -90,18 +97,9 @@ def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sig
 
 @pytest.mark.parametrize("case", [Case("epnp-lm", noise="sigma"), Case("epnp-lm", noise="covariance", extra="prior")])
 def test_gradients(case):
-    """By all inputs. As in ``laws.gradcheck`` each of them moves relative to its own size."""
     call, pose = make(case, 1)
-    call |= {"pose": pose, "weights": torch.linspace(0.1, 0.9, PAIRS, dtype=torch.float64)[None]}
-    leaves, spec = pytree.tree_flatten(call)
-    sizes = [x.abs().mean() if x.shape[1:] in ((PAIRS, 2), (PAIRS, 3)) else x for x in leaves]
-
-    def run(*changes):
-        moved = [x + size * d for x, size, d in zip(leaves, sizes, changes, strict=True)]
-        return pose_covariance(**pytree.tree_unflatten(moved, spec))
-
-    changes = [torch.zeros_like(x).requires_grad_() for x in leaves]
-    assert torch.autograd.gradcheck(run, changes, eps=1e-6, atol=1e-6, rtol=1e-3, fast_mode=True)
+    call |= {"pose": pose, "weights": torch.linspace(0.1, 0.9, PAIRS, dtype=DOUBLE)[None]}
+    gradcheck_by_size(pose_covariance, call, atol=1e-6)
 
 
 def test_an_unknown_focal_length_is_that_of_the_result(make_problems):
@@ -111,8 +109,7 @@ def test_an_unknown_focal_length_is_that_of_the_result(make_problems):
     result = create_solver("p3p-ransac", focal="unknown")(*p[:2], nominal, img_sigma=1.0)
     assert result.ok.all()
     noise = {"img_sigma": 1.0, "focal": "unknown"}
-    weights = result.inliers.double()
-    expected = pose_covariance(result.pose, *p[:2], result.intrinsics, **noise, weights=weights)
+    expected = pose_covariance(result.pose, *p[:2], result.intrinsics, **noise, weights=result.inliers.double())
     assert expected.isfinite().all()
     torch.testing.assert_close(result.covariance(*p[:2], nominal, **noise), expected)
     assert pose_covariance(result.pose, *p[:2], nominal, **noise).diagonal(dim1=1, dim2=2).isinf().all()
@@ -120,10 +117,97 @@ def test_an_unknown_focal_length_is_that_of_the_result(make_problems):
 
 def test_a_prior_adds_its_information(make_problems):
     p = make_problems(n=8, batch=5)
-    far = p._replace(world_points=p.world_points + 100.0)  # in the frame of the caller, not of the centroid
-    pose = Pose(p.pose.rotation, p.pose.translation - (p.pose.rotation @ torch.full((3,), 100.0, dtype=torch.float64)))
-    information = torch.diag(torch.tensor([1e3, 2e3, 3e3, 4.0, 5.0, 6.0], dtype=torch.float64)).expand(5, 6, 6)
-    given = pose, *far[:3]
+    pose = Pose(p.pose.rotation, p.pose.translation - (p.pose.rotation @ torch.full((3,), 100.0, dtype=DOUBLE)))
+    information = torch.diag(torch.tensor([1e3, 2e3, 3e3, 4.0, 5.0, 6.0], dtype=DOUBLE)).expand(5, 6, 6)
+    given = pose, p.world_points + 100.0, *p[1:3]  # in the frame of the caller, not of the centroid
     alone = pose_covariance(*given, img_sigma=1.0)
     found = pose_covariance(*given, img_sigma=1.0, prior=PosePrior(pose, information))
     torch.testing.assert_close(torch.linalg.inv(found), torch.linalg.inv(alone) + information, rtol=1e-6, atol=1e-3)
+
+
+def problems(n=9, batch=4, outliers=0, **options):
+    """Problems with covariances of ratio 5, seen by a camera with a skew and two focal lengths."""
+    options = {"axis_ratio": 5.0, "known_noise": 1.0, "img_sigma": 10.0, "dtype": DOUBLE, "seed": 3, **options}
+    p = SyntheticProblems(n=n, batch_size=batch, outliers=OutlierMix(count=outliers), **options).batch(0)
+    change = CAMERA[:2, :2] @ torch.diag(1.0 / p.intrinsics[0].diagonal()[:2])
+    img = p.img_points @ change.mT + CAMERA[:2, 2]
+    return p._replace(img_points=img, img_cov=change @ p.img_cov @ change.mT, intrinsics=CAMERA.expand(batch, 3, 3))
+
+
+def least_squares(m=30, **options):
+    options = {"robustness": 0.0, "reject_worse": False, "learnable": False, **options}
+    return PnPNet(None, RobustWeightedLM(m, **options))
+
+
+def whitened(p, pose):
+    """The Jacobian (B, 2N, 6) by the tangent and the residual (B, 2N), all derivatives by autograd."""
+
+    def total(world):
+        return reprojection_errors(p._replace(world_points=world), pose).sum((0, 1))
+
+    residual = reprojection_errors(p, pose)
+    jacobian = derivative(lambda x: reprojection_errors(p, x.pose).flatten(1), State.of(pose))
+    by_point = torch.autograd.functional.jacobian(total, p.world_points).movedim(0, 2)  # (B, N, 2, 3)
+    covariance = p.img_cov + by_point @ p.world_cov @ by_point.mT
+    whiten = torch.linalg.inv(torch.linalg.cholesky(covariance))
+    return (whiten @ jacobian.unflatten(1, (-1, 2))).flatten(1, 2), (whiten @ residual[..., None]).flatten(1)
+
+
+def test_poses_covariances_and_weights_are_those_of_a_dense_solver():
+    p = problems()
+    result = least_squares()(*p[:3], init=p.pose, **p.known)
+    robust = least_squares(kernel="cauchy", robustness=3.0)(*p[:3], init=p.pose, **p.known)
+    covariance = pose_covariance(result.pose, *p[:3], **p.known)
+    pose = p.pose
+    for _ in range(30):
+        jacobian, residual = whitened(p, pose)
+        pose = retract(pose, -torch.linalg.lstsq(jacobian, residual[..., None]).solution[..., 0])
+    torch.testing.assert_close(result.rotation, pose.rotation, rtol=0, atol=1e-9)
+    torch.testing.assert_close(result.translation, pose.translation, rtol=0, atol=1e-7)
+    torch.testing.assert_close(covariance, torch.linalg.inv(jacobian.mT @ jacobian), rtol=1e-6, atol=1e-12)
+    _, residual = whitened(p, robust.pose)
+    distance = residual.unflatten(1, (-1, 2)).square().sum(-1)
+    torch.testing.assert_close(robust.weights, 1.0 / (1.0 + distance / 9.0), rtol=1e-6, atol=0)
+
+
+def test_an_isotropic_covariance_is_a_sigma():
+    p, sigma = problems(), torch.linspace(0.01, 0.1, 36, dtype=DOUBLE).view(4, 9)
+    noises = {"world_sigma": sigma}, {"world_cov": sigma.square()[..., None, None] * torch.eye(3, dtype=DOUBLE)}
+    torch.testing.assert_close(*(pose_covariance(p.pose, *p[:3], img_cov=p.img_cov, **x) for x in noises))
+
+
+def test_exact_points_and_exact_pixels_are_sound():
+    p, exact = problems(batch=20, world_sigma=0.0), torch.zeros(20, 9, 3, 3, dtype=DOUBLE, requires_grad=True)
+    result = create_solver("pnpnet-set")(*p[:3], img_cov=p.img_cov, world_cov=exact)
+    assert result.ok.all()
+    assert torch.autograd.grad(result.rotation.sum(), exact)[0].isfinite().all()
+    flat = torch.diag(torch.tensor([1.0, 0.0], dtype=DOUBLE)).expand_as(p.img_cov)  # exact in the vertical
+    result = create_solver("epnp-lm")(*p[:3], img_cov=flat, world_cov=problems(batch=20).world_cov)
+    assert result.matrix.isfinite().all()
+    assert result.ok.double().mean() > 0.9
+
+
+def test_covariances_reach_the_bound_and_sigmas_do_not():
+    p = problems(n=20, batch=1500, outliers=6, world_sigma=0.02)
+    solver, sigmas = create_solver("pnpnet-set"), {"img_sigma": 10.0 * 30.0 / 113.0, "world_sigma": 0.02}
+    found = KnownInliersAndNoise().solve_with_truth(p), solver(*p[:3], **p.known), solver(*p[:3], **sigmas)
+    errors = [torch.stack(list(pose_errors(x.pose, p.pose))).median(1).values for x in found]
+    assert (errors[1] < 1.05 * errors[0]).all()
+    assert (errors[2] > 1.15 * errors[0]).all()
+
+
+@pytest.mark.parametrize("sigmas", [{}, {"img_sigma": 0.5}, {"img_sigma": 0.5, "world_sigma": 0.002}])
+def test_the_likelihood_is_that_of_the_covariances(sigmas):
+    """Laplace's approximation, exact in the limit: the density of the covariance at the mode."""
+    p = problems(n=60, img_sigma=0.5, world_sigma=0.002)
+    given = {name: torch.full((4, 60), x, dtype=DOUBLE) for name, x in sigmas.items()} or p.known
+    mode = least_squares()(*p[:3], init=p.pose, **given).pose
+    known = {"world_sigma": 0.0, **given} if "img_sigma" in given else given
+    expected = 0.5 * torch.logdet(2.0 * math.pi * pose_covariance(mode, *p[:3], **known))
+    torch.manual_seed(0)
+    noise = {name: x.clone().requires_grad_() for name, x in given.items()}
+    loss = monte_carlo_pose_loss(mode, mode, *p[:3], **noise, samples=2000, kernel="truncated", scale=1e3)
+    assert_same(loss, expected, atol=0.1)
+    for gradient in torch.autograd.grad(loss.sum(), list(noise.values())):
+        assert gradient.isfinite().all()
+        assert (gradient != 0).any()

@@ -1,5 +1,6 @@
 """Code of the documentation that replaces a call of another package, run against that package where it is installed."""
 
+import itertools
 import re
 import warnings
 from pathlib import Path
@@ -40,43 +41,36 @@ def snippet(page, heading=""):
     return names
 
 
-def write_hloc_scene(folder, views=8, points=300, seed=0):
+def write_hloc_scene(folder, points=300):
     """A COLMAP model, features and matches in hloc's files; four in ten matches are wrong. Returns the true poses."""
-    h5py = real("h5py")
-    rng = np.random.default_rng(seed)
+    h5py, rng = real("h5py"), np.random.default_rng(0)
     world = rng.uniform([-4, -3, 6], [4, 3, 12], (points, 3))
     poses = {}
-    for i in range(views):
+    for i in range(8):
         turn = Pose.from_rvec(torch.from_numpy(rng.normal(0, 0.05, (1, 3))), torch.zeros(1, 3)).rotation[0].numpy()
         poses[f"{i}.png"] = np.column_stack((turn, rng.normal(0, 0.3, 3)))
-    images, tracks = [], [[] for _ in world]
+    references, queries, images = list(poses)[:4], list(poses)[4:], []
     with h5py.File(folder / "features.h5", "w") as features:
-        for i, (name, pose) in enumerate(poses.items()):
+        for i, (name, pose) in enumerate(poses.items(), start=1):
             cam = world @ pose[:, :3].T + pose[:, 3]
             pixels = 500.0 * cam[:, :2] / cam[:, 2:] + [320.0, 240.0] + rng.normal(0, 0.5, (points, 2))
             features.create_group(name)["keypoints"] = pixels - 0.5  # hloc counts from the centre of the first pixel
-            if i < views // 2:
-                quaternion = pycolmap.Rigid3d(pose).rotation.quat
-                numbers = " ".join(map(str, [*quaternion[[3, 0, 1, 2]], *pose[:, 3]]))
-                seen = " ".join(f"{u} {v} {j + 1}" for j, (u, v) in enumerate(pixels))
-                images.append(f"{i + 1} {numbers} 1 {name}\n{seen}\n")
-                for j, track in enumerate(tracks):
-                    track.append(f"{i + 1} {j}")
+            if name in references:
+                numbers = " ".join(map(str, [*pycolmap.Rigid3d(pose).rotation.quat[[3, 0, 1, 2]], *pose[:, 3]]))
+                seen = " ".join(f"{u} {v} {j}" for j, (u, v) in enumerate(pixels, start=1))
+                images.append(f"{i} {numbers} 1 {name}\n{seen}\n")
     model = folder / "model"
     model.mkdir()
     (model / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
     (model / "images.txt").write_text("".join(images))
-    rows = [f"{j + 1} {x} {y} {z} 0 0 0 0 {' '.join(tracks[j])}\n" for j, (x, y, z) in enumerate(world)]
+    rows = [f"{j + 1} {x} {y} {z} 0 0 0 0 1 {j} 2 {j} 3 {j} 4 {j}\n" for j, (x, y, z) in enumerate(world)]
     (model / "points3D.txt").write_text("".join(rows))
-    references, queries = list(poses)[: views // 2], list(poses)[views // 2 :]
     with h5py.File(folder / "matches.h5", "w") as matches:
-        for query in queries:
-            for reference in references:
-                found = np.arange(points)
-                wrong = rng.random(points) < 0.4
-                found[wrong] = rng.integers(points, size=wrong.sum())
-                group = matches.create_group(f"{query}/{reference}")
-                group["matches0"], group["matching_scores0"] = found, np.ones(points)
+        for query, reference in itertools.product(queries, references):
+            found, wrong = np.arange(points), rng.random(points) < 0.4
+            found[wrong] = rng.integers(points, size=wrong.sum())
+            group = matches.create_group(f"{query}/{reference}")
+            group["matches0"], group["matching_scores0"] = found, np.ones(points)
     (folder / "queries.txt").write_text("".join(f"{query} PINHOLE 640 480 500 500 320 240\n" for query in queries))
     (folder / "retrieval.txt").write_text("".join(f"{q} {r}\n" for q in queries for r in references))
     return {query: poses[query] for query in queries}
@@ -88,14 +82,10 @@ def hloc_errors(localize_sfm, folder, truth):
     localize_sfm.main(folder / "model", *(folder / name for name in names))
     rows = [line.split() for line in (folder / "poses.txt").read_text().splitlines()]
     assert len(rows) == len(truth)
-    errors = []
-    for name, *numbers in rows:
-        numbers = torch.tensor([list(map(float, numbers))], dtype=torch.float64)
-        found = Pose.from_quaternion(numbers[:, :4], numbers[:, 4:])
-        pose = torch.from_numpy(truth[name])[None]
-        error = pose_errors(found, Pose(pose[..., :3], pose[..., 3]))
-        errors.append((error.rotation_error_deg.item(), error.translation_error.item()))
-    return np.max(errors, 0)
+    numbers = torch.tensor([list(map(float, row[1:])) for row in rows], dtype=torch.float64)
+    true = torch.from_numpy(np.stack([truth[row[0]] for row in rows]))
+    errors = pose_errors(Pose.from_quaternion(numbers[:, :4], numbers[:, 4:]), Pose(true[..., :3], true[..., 3]))
+    return torch.stack([*errors]).amax(1).numpy()
 
 
 @pytest.mark.slow
@@ -141,17 +131,6 @@ def test_dust3r_gets_focal_length_and_pose_from_the_function_of_the_page(monkeyp
         assert ours[2] < max(0.02, distance)
 
 
-def quaternion_problems(batch=64, n=24, sigma=0.01):
-    """Problems in normalised coordinates as EPro-PnP's arguments, and the true poses (B, 7)."""
-    generator = torch.Generator().manual_seed(0)
-    x3d = torch.randn(batch, n, 3, generator=generator)
-    pose = Pose.from_rvec(torch.randn(batch, 3, generator=generator), torch.tensor([0.0, 0.0, 6.0]).expand(batch, 3))
-    cam = x3d @ pose.rotation.mT + pose.translation[:, None]
-    x2d = cam[..., :2] / cam[..., 2:] + sigma * torch.randn(batch, n, 2, generator=generator)
-    truth = torch.cat((pose.translation, pose.quaternion), -1)
-    return x3d, x2d, torch.full_like(x2d, 1.0 / sigma), torch.eye(3).expand(batch, 3, 3), truth
-
-
 def median_errors(poses, truth):
     """Median angle in radians and distance of poses (B, 7)."""
     cosine = (poses[:, 3:] * truth[:, 3:]).sum(-1).abs().clamp(max=1.0)
@@ -159,18 +138,22 @@ def median_errors(poses, truth):
 
 
 @pytest.mark.slow
-def test_epro_pnps_layer_and_loss_are_two_calls():
+def test_epro_pnps_layer_and_loss_are_two_calls(generator):
     epropnp, lm = real("epropnp.epropnp"), real("epropnp.levenberg_marquardt")
     camera, cost = real("epropnp.camera").PerspectiveCamera(), real("epropnp.cost_fun").AdaptiveHuberPnPCost()
     start = lm.RSLMSolver(dof=6, num_points=8, num_proposals=128, num_iter=5)
     layer = epropnp.EProPnP6DoF(mc_samples=512, num_iter=4, solver=lm.LMSolver(dof=6, num_iter=10, init_solver=start))
     ours = snippet("examples/clients.md", "EPro-PnP")
-    *arguments, truth = quaternion_problems()
-    x3d, x2d, w2d, cam_mats = arguments
+    # Problems in normalised coordinates, and the true poses (B, 7).
+    x3d, cam_mats = torch.randn(64, 24, 3, generator=generator), torch.eye(3).expand(64, 3, 3)
+    pose = Pose.from_rvec(torch.randn(64, 3, generator=generator), torch.tensor([0.0, 0.0, 6.0]).expand(64, 3))
+    cam = x3d @ pose.rotation.mT + pose.translation[:, None]
+    x2d = cam[..., :2] / cam[..., 2:] + 0.01 * torch.randn(64, 24, 2, generator=generator)
+    w2d, truth = torch.full_like(x2d, 100.0), torch.cat((pose.translation, pose.quaternion), -1)
     camera.set_param(cam_mats)
     cost.set_param(x2d, w2d)
     theirs = layer(x3d, x2d, w2d, camera, cost)[0]
-    found = [median_errors(poses, truth) for poses in (ours["forward_test"](*arguments), theirs)]
+    found = [median_errors(poses, truth) for poses in (ours["forward_test"](x3d, x2d, w2d, cam_mats), theirs)]
     assert max(found[0]) < 0.1
     assert all(a < 1.2 * b for a, b in zip(*found, strict=True))
 

@@ -10,21 +10,27 @@ import pytest
 import torch
 from torch import nn
 
-import kornia_pnpnet.evaluation.comparison
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, pose_errors, success, success_rate
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.evaluation import comparison
+from kornia_pnpnet.evaluation import results as results_module
 from kornia_pnpnet.evaluation.bounds import KnownInliers
 from kornia_pnpnet.evaluation.comparison import EvaluationData, draw_problems, evaluate
 from kornia_pnpnet.evaluation.results import format_table, load_results, row_errors, save_results, source_digest
 from kornia_pnpnet.result import PnPResult, Pose
 
+CLEAN = {"clean": EvaluationData(SyntheticProblems(batch_size=100, seed=5).batch(0), description={"seed": 5})}
+SPOILT = SyntheticProblems(batch_size=100, seed=5, outliers=OutlierMix(count=2))
+SETS = {**CLEAN, "spoilt": EvaluationData(draw_problems(SPOILT, 60), max_translation=0.5, unit="")}
+SOLVER = PnPNet(None, RobustWeightedLM(m=10, learnable=False))
+
 
 @pytest.fixture(autouse=True)
 def _same_code(monkeypatch):
     """Keep the digest of the code fixed: the package may be edited while its tests run."""
-    monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "source_digest", lambda: "the code")
+    monkeypatch.setattr(comparison, "source_digest", lambda: "the code")
 
 
 class _Fixed(nn.Module):
@@ -61,30 +67,14 @@ def names(results):
 
 
 @pytest.fixture(scope="module")
-def sets():
-    clean = SyntheticProblems(batch_size=100, seed=5)
-    spoilt = SyntheticProblems(batch_size=100, seed=5, outliers=OutlierMix(count=2))
-    return {
-        "clean": EvaluationData(draw_problems(clean, 100), description={"seed": 5}),
-        "spoilt": EvaluationData(draw_problems(spoilt, 60), max_translation=0.5, unit=""),
-    }
+def evaluated():
+    return evaluate({"lm": SOLVER, "fixed": _Fixed()}, SETS)
 
 
-@pytest.fixture(scope="module")
-def solver():
-    return PnPNet(None, RobustWeightedLM(m=10, learnable=False))
-
-
-@pytest.fixture(scope="module")
-def evaluated(sets, solver):
-    return evaluate({"lm": solver, "fixed": _Fixed()}, sets)
-
-
-def test_rows_hold_the_errors_of_the_solver(evaluated, sets, solver):
-    assert names(evaluated) == [(data, name) for data in sets for name in ("lm", "fixed")]
-    row = evaluated["rows"][2]
-    problems = sets["spoilt"].problems
-    result = solver(*problems[:3])
+def test_rows_hold_the_errors_of_the_solver(evaluated):
+    assert names(evaluated) == [(data, name) for data in SETS for name in ("lm", "fixed")]
+    row, problems = evaluated["rows"][2], SETS["spoilt"].problems
+    result = SOLVER(*problems[:3])
     errors, ok = row_errors(row)
     expected = pose_errors(as_double(result.pose), as_double(problems.pose))
     torch.testing.assert_close(tuple(errors), tuple(expected), rtol=1e-5, atol=1e-9)
@@ -109,21 +99,21 @@ def test_summaries_and_table_are_those_of_the_stored_errors(evaluated):
         assert cells[4].endswith(" m") == (entry["unit"] == "m")
 
 
-def test_big_sets_are_solved_in_chunks_with_one_untimed_call(sets):
+def test_big_sets_are_solved_in_chunks_with_one_untimed_call():
     solver = _Fixed().train()
-    results = evaluate({"fixed": solver}, {"clean": sets["clean"]}, chunk=40, repeats=4)
+    results = evaluate({"fixed": solver}, CLEAN, chunk=40, repeats=4)
     assert solver.sizes == [40, 40, 40, 20, 40]
     assert solver.training  # as before; `_Fixed` checks the mode during its calls
-    whole = evaluate({"fixed": solver}, {"clean": sets["clean"]})
+    whole = evaluate({"fixed": solver}, CLEAN)
     assert results["rows"][0]["per_problem"] == whole["rows"][0]["per_problem"]
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_pose_that_is_not_finite_is_a_failure(sets, bad):
-    results = evaluate({"bad": _Fixed(bad=bad), "fixed": _Fixed()}, {"clean": sets["clean"]})
-    broken, whole = results["rows"]
-    assert broken["per_problem"]["ok"] == [0] + 99 * [1]
-    assert broken["per_problem"]["translation_error"] == whole["per_problem"]["translation_error"]
+def test_a_pose_that_is_not_finite_is_a_failure():
+    solvers = {"nan": _Fixed(bad=math.nan), "inf": _Fixed(bad=math.inf), "fixed": _Fixed()}
+    *broken, whole = (row["per_problem"] for row in evaluate(solvers, CLEAN)["rows"])
+    for row in broken:
+        assert row["ok"] == [0] + 99 * [1]
+        assert row["translation_error"] == whole["translation_error"]
 
 
 def test_fewer_problems_are_the_first_of_more():
@@ -131,13 +121,9 @@ def test_fewer_problems_are_the_first_of_more():
     few, many = draw_problems(source, 5), draw_problems(source, 20)
     assert {len(part) for part in iter_tensors(many)} == {20}
     assert all(map(torch.equal, iter_tensors(few), iter_tensors(many.map(lambda part: part[:5]))))
-    second = many.map(lambda part: part[8:16])
-    assert all(map(torch.equal, iter_tensors(second), iter_tensors(source.batch(1))))
+    assert all(map(torch.equal, iter_tensors(many.map(lambda part: part[8:16])), iter_tensors(source.batch(1))))
     with pytest.raises(ValueError, match="at least 1"):
         draw_problems(source, 0)
-
-
-# -- results files -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -156,12 +142,9 @@ def test_other_files_are_refused(tmp_path, content):
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        ("rows.0.success.rate", 1.5),
-        ("rows.0.success.rate", math.nan),
-        ("rows.0.success.total", 0.5),
-        ("rows.0.success.total", 2**63),
-        ("rows.0.us_per_problem", "1"),
-        ("rows.0.us_per_problem", 10**400),
+        *(("rows.0.success.rate", value) for value in (1.5, math.nan)),
+        *(("rows.0.success.total", value) for value in (0.5, 2**63)),
+        *(("rows.0.us_per_problem", value) for value in ("1", 10**400)),
         ("rows.0.solver", "t"),
         ("rows.0.per_problem.ok", 1),
         ("rows.0.per_problem", {"rotation_error_deg": [], "translation_error": [0.0], "ok": [1]}),
@@ -180,16 +163,13 @@ def test_the_wrong_entry_of_a_file_is_named(evaluated, place, value, path):
 
 
 def test_the_digest_of_the_code_covers_python_files_and_their_places(tmp_path, monkeypatch):
-    monkeypatch.setattr(kornia_pnpnet.evaluation.results, "__file__", str(tmp_path / "evaluation" / "results.py"))
+    monkeypatch.setattr(results_module, "__file__", str(tmp_path / "evaluation" / "results.py"))
     digests = []
     for name, content in (("a.py", "b = 2"), ("a.py", "b = 3"), ("c.py", ""), ("notes.txt", "")):
         (tmp_path / name).write_text(content)
         digests.append(source_digest())
     assert len({*digests}) == 3
     assert digests[2] == digests[3]
-
-
-# -- continuing --------------------------------------------------------------------------------------------------------
 
 
 def without_times(results):
@@ -199,59 +179,67 @@ def without_times(results):
 
 
 @pytest.mark.parametrize(("calls", "finished"), [(1, 1), (6, 3)])
-def test_interrupted_and_continued_equals_uninterrupted(sets, path, calls, finished):
+def test_interrupted_and_continued_equals_uninterrupted(path, calls, finished):
     """The second solver has four calls on each of the two sets."""
-    whole = evaluate({"first": _Fixed(), "second": _Fixed()}, sets, repeats=3)
+    whole = evaluate({"first": _Fixed(), "second": _Fixed()}, SETS, repeats=3)
     with pytest.raises(KeyboardInterrupt):
-        evaluate({"first": _Fixed(), "second": _Fixed(calls=calls)}, sets, path=path)
+        evaluate({"first": _Fixed(), "second": _Fixed(calls=calls)}, SETS, path=path)
     kept = load_results(path)["rows"]
     assert len(kept) == finished
     solvers = {"first": _Fixed(), "second": _Fixed()}
-    continued = evaluate(solvers, sets, path=path)
+    continued = evaluate(solvers, SETS, path=path)
     assert continued["rows"][:finished] == kept  # no finished row is measured again
     assert without_times(continued) == without_times(whole)
     assert load_results(path) == continued
     assert len(solvers["first"].sizes) == (4 if calls < 4 else 0)
-    assert evaluate({"first": _Fixed(), "second": _Fixed(calls=0)}, sets, path=path) == continued
+    assert evaluate({"first": _Fixed(), "second": _Fixed(calls=0)}, SETS, path=path) == continued
 
 
-def test_solvers_and_sets_may_be_added(sets, solver, path):
-    evaluate({"fixed": _Fixed()}, {"spoilt": sets["spoilt"]}, path=path)
+def test_solvers_and_sets_may_be_added(path):
+    evaluate({"fixed": _Fixed()}, {"spoilt": SETS["spoilt"]}, path=path)
     before = {**load_results(path), "note": "not ours"}
     save_results(before, path)
     counted = _Fixed()
-    grown = evaluate({"lm": solver, "fixed": counted}, sets, path=path)
-    assert names(grown) == [(data, name) for data in sets for name in ("lm", "fixed")]
+    grown = evaluate({"lm": SOLVER, "fixed": counted}, SETS, path=path)
+    assert names(grown) == [(data, name) for data in SETS for name in ("lm", "fixed")]
     assert grown["rows"][3] == before["rows"][0]
     assert counted.sizes == 4 * [100]
-    assert list(grown["data"]) == list(sets)
+    assert list(grown["data"]) == list(SETS)
     assert grown["note"] == "not ours"
 
 
 def other(function=lambda part: part, **changes):
     """Change the problems or a field of the data set ``clean``."""
-    return lambda _, data: data.update(
+    return lambda _, data, patch: data.update(
         clean=data["clean"]._replace(problems=map_tensors(function, data["clean"].problems), **changes)
     )
+
+
+def other_versions(solvers, data, patch):
+    env = environment()
+    env["versions"]["torch"] = "0.1"
+    patch.setattr(comparison, "environment", lambda: env)
+    patch.setattr(comparison, "source_digest", lambda: "other")
 
 
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (lambda solvers, data: solvers.update(lm=lm(m=4)), r"lm\.config\.refine\.m was 3 and is 4"),
-        (lambda solvers, data: solvers.update(lm=lm(seed=1)), r"lm\.weights was"),
-        (lambda solvers, data: solvers.pop("fixed"), r"solvers\.fixed\."),
-        (lambda solvers, data: data.pop("clean"), r"data\.clean\."),
+        (lambda solvers, *_: solvers.update(lm=lm(m=4)), r"lm\.config\.refine\.m was 3 and is 4"),
+        (lambda solvers, *_: solvers.update(lm=lm(seed=1)), r"lm\.weights was"),
+        (lambda solvers, *_: solvers.pop("fixed"), r"solvers\.fixed\."),
+        (lambda solvers, data, _: data.pop("clean"), r"data\.clean\."),
         (other(max_translation=0.1), r"clean\.max_translation was 0.2 and is 0.1"),
         (other(lambda part: part.flip(0)), r"clean\.digest was"),
         (other(as_double), r"clean\.dtype was"),
+        (other_versions, r"torch was .* and is '0\.1'; code was"),
     ],
 )
-def test_rows_of_another_evaluation_are_refused(sets, path, change, named):
-    solvers, data = {"lm": lm(), "fixed": _Fixed()}, dict(sets)
+def test_rows_of_another_evaluation_are_refused(path, monkeypatch, change, named):
+    solvers, data = {"lm": lm(), "fixed": _Fixed()}, dict(SETS)
     evaluate(solvers, data, path=path)
     before = path.read_bytes()
-    change(solvers, data)
+    change(solvers, data, monkeypatch)
     with pytest.raises(ValueError, match=rf"results\.json.*{named}"):
         evaluate(solvers, data, path=path)
     assert path.read_bytes() == before
@@ -260,47 +248,34 @@ def test_rows_of_another_evaluation_are_refused(sets, path, change, named):
     assert without_times(anew) == without_times(evaluate(solvers, data))
 
 
-def test_rows_of_other_code_or_versions_are_refused(sets, path, monkeypatch):
-    evaluate({"fixed": _Fixed()}, sets, path=path)
-    env = environment()
-    env["versions"]["torch"] = "0.1"
-    monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "environment", lambda: env)
-    monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "source_digest", lambda: "other")
-    with pytest.raises(ValueError, match=r"torch was .* and is '0\.1'; code was"):
-        evaluate({"fixed": _Fixed()}, sets, path=path)
-
-
-def test_rows_of_another_machine_name_it(sets, path, monkeypatch):
+def test_rows_of_another_machine_name_it(path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
-        evaluate({"first": _Fixed(), "second": _Fixed(calls=0)}, {"clean": sets["clean"]}, path=path)
+        evaluate({"first": _Fixed(), "second": _Fixed(calls=0)}, CLEAN, path=path)
     env = {**environment(), "cpu": "an abacus", "threads": 100, "date": "tomorrow"}
-    monkeypatch.setattr(kornia_pnpnet.evaluation.comparison, "environment", lambda: env)
-    first, second = evaluate({"first": _Fixed(), "second": _Fixed()}, {"clean": sets["clean"]}, path=path)["rows"]
+    monkeypatch.setattr(comparison, "environment", lambda: env)
+    first, second = evaluate({"first": _Fixed(), "second": _Fixed()}, CLEAN, path=path)["rows"]
     assert "environment" not in first
     assert second["environment"] == {"cpu": "an abacus", "threads": 100}
 
 
-def test_a_path_that_cannot_be_written_is_an_error_before_the_work(sets, tmp_path):
+def test_a_path_that_cannot_be_written_is_an_error_before_the_work(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path, tmp_path / "file" / "results.json"):
         with pytest.raises(OSError, match=r"directory|exists"):
-            evaluate({"fixed": _Fixed(calls=0)}, sets, path=path)
+            evaluate({"fixed": _Fixed(calls=0)}, SETS, path=path)
 
 
-# -- inputs of solvers -------------------------------------------------------------------------------------------------
-
-
-def test_only_bounds_get_the_truth(sets):
-    rows = evaluate({"bound": KnownInliers(), "fixed": _Fixed()}, {"clean": sets["clean"]}, chunk=50)["rows"]
+def test_only_bounds_get_the_truth():
+    rows = evaluate({"bound": KnownInliers(), "fixed": _Fixed()}, CLEAN, chunk=50)["rows"]
     assert rows[0]["success"]["rate"] > 0.7
     assert rows[1]["success"]["rate"] == 0.0
 
 
-def test_only_our_solvers_get_the_noise_level(sets):
+def test_only_our_solvers_get_the_noise_level():
     known = EvaluationData(draw_problems(SyntheticProblems(batch_size=40, seed=3, known_noise=1.0), count=60))
     given, ours = [], PnPNet(None, RobustWeightedLM(1))
     ours.register_forward_pre_hook(lambda _, args, noise: given.append(noise), with_kwargs=True)
-    for data in (known, sets["clean"]):
+    for data in (known, CLEAN["clean"]):
         evaluate({"ours": ours, "other": _Fixed()}, {"data": data}, chunk=60)
         for noise in given:
             assert noise.keys() == data.problems.sigmas.keys()
@@ -320,10 +295,10 @@ def test_a_solver_for_another_n_is_left_out(path):
         assert load_results(path) == results
 
 
-def test_an_error_says_where_it_was_and_keeps_the_rows(sets, path):
+def test_an_error_says_where_it_was_and_keeps_the_rows(path):
     broken = _Fixed(calls=0, error=RuntimeError("no memory"))
     with pytest.raises(RuntimeError, match="no memory") as caught:
-        evaluate({"fixed": _Fixed(), "broken": broken}, sets, path=path)
+        evaluate({"fixed": _Fixed(), "broken": broken}, SETS, path=path)
     assert caught.value.__notes__ == ["broken on clean"]
     assert len(load_results(path)["rows"]) == 1
 
@@ -335,10 +310,6 @@ def test_the_digest_covers_every_field_of_the_problems():
     problems = SyntheticProblems(batch_size=4, known_noise=1.0).batch(0)
     assert digest(problems) == digest(problems.map(torch.clone)) == digest(as_double(problems))
     for field in iter_tensors(problems):
-
-        def change(part, field=field):
-            if part is not field:
-                return part
-            return torch.cat((~part[:1] if part.dtype == torch.bool else part[:1] + 1.0, part[1:]))
-
-        assert digest(problems.map(change)) != digest(problems)
+        new = torch.cat((~field[:1] if field.dtype == torch.bool else field[:1] + 1.0, field[1:]))
+        changed = problems.map(lambda part, field=field, new=new: new if part is field else part)
+        assert digest(changed) != digest(problems)

@@ -22,8 +22,8 @@ from kornia_pnpnet.export import OUTPUTS, RIG_INPUTS, export_onnx, export_packag
 CPP = Path(__file__).resolve().parents[1] / "docs" / "examples" / "cpp"
 
 
-def inputs_of(problems, weights=None):
-    weights = torch.ones_like(problems.world_points[..., 0]) if weights is None else weights
+def inputs_of(problems):
+    weights = torch.ones_like(problems.world_points[..., 0])
     return *(x.float() for x in (*problems[:3], weights)), *(problems.cam_from_rig or ())
 
 
@@ -107,9 +107,8 @@ def test_exports(kind, name, n, batch, sizes, is_rig, make_problems, tmp_path):
             problems = CameraProblems(n=count, batch_size=size, seed=5, cameras=3, outlier_share=0.25).batch(0)
         else:
             problems.world_points[3:4, 1] = torch.nan
-        weights = torch.ones_like(problems.world_points[..., 0])
-        weights[:, 4:5] = 0.0 if name == "pnpnet-set" and n is None else 1.0
-        inputs = inputs_of(problems, weights)
+        inputs = inputs_of(problems)
+        inputs[3][:, 4:5] = 0.0 if name == "pnpnet-set" and n is None else 1.0
         before = [x.clone() for x in inputs]
         found = run(*inputs)
         near(found, solver, inputs)
@@ -172,9 +171,6 @@ def test_what_an_export_needs_is_checked_before_it_starts(name, missing, tmp_pat
     assert "C++ compiler" in err if missing == "compiler" else "pip install '.[onnx]'" in err
 
 
-# -- ahead-of-time packages --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_what_a_package_takes(make_problems, tmp_path):
     """Tensors of other dtypes and layouts than the package was compiled for, but no other shapes."""
@@ -202,8 +198,7 @@ def test_cpp_example(make_problems, tmp_path):
     subprocess.run(["cmake", "-S", CPP, "-B", tmp_path / "build", prefix], check=True)
     subprocess.run(["cmake", "--build", tmp_path / "build"], check=True)
 
-    problems = make_problems(n=9, batch=1)
-    world, img, intrinsics, _ = inputs_of(problems)
+    world, img, intrinsics, _ = inputs_of(make_problems(n=9, batch=1))
     rows = torch.cat((world, img), -1)[0].tolist()
     table = tmp_path / "matches.csv"
     table.write_text("\n".join(["X,Y,Z,u,v", *(",".join(map(repr, row)) for row in rows)]) + "\n")

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
 from strategies import damage, many
-from test_training_loop import LossWith, comparable, make_parts, read_history
+from test_training_loop import LossWith, comparable, forks, make_parts, read_history
 
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM
 from kornia_pnpnet.cli import main
@@ -28,11 +28,7 @@ from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME
 resource = pytest.importorskip("resource", reason="not on Windows")
 
 KILLS = 20
-# Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
-    pytest.mark.skipif(sys.platform != "linux", reason="forks"),
-]
+pytestmark = [forks, pytest.mark.skipif(sys.platform != "linux", reason="forks")]
 
 
 def train(folder, updates=40, resume=False, **changes):

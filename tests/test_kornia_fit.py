@@ -20,13 +20,16 @@ def cameras(intrinsics):
     return Pose(eye, torch.full_like(eye[:, 0], 5.0)).camera(intrinsics, height=7, width=7)
 
 
-def test_covariances_and_first_guesses_take_cameras(make_problems):
-    p = make_problems(n=9, batch=5)
-    known = {"img_sigma": 1.0}
-    expected = pose_covariance(p.pose, *p[:3], **known)
-    assert pose_covariance(p.pose, *p[:2], cameras(p.intrinsics), **known).equal(expected)
+def test_covariances_and_first_guesses_take_cameras_and_one_camera_serves_three_problems(make_problems):
+    p, solver = make_problems(batch=5), create_solver("epnp")
+    expected = pose_covariance(p.pose, *p[:3], img_sigma=1.0)
+    assert pose_covariance(p.pose, *p[:2], cameras(p.intrinsics), img_sigma=1.0).equal(expected)
     result, _ = PnPNet(None).with_starts(*p[:2], cameras(p.intrinsics), init=p.pose)
     assert result.matrix.equal(PnPNet(None)(*p[:3], init=p.pose).matrix)
+    three = p.world_points[:3], p.img_points[:3]  # as many problems as the matrix of a camera has rows
+    assert solver(*three, cameras(p.intrinsics[:1])).matrix.equal(solver(*three, p.intrinsics[0]).matrix)
+    with pytest.raises(ShapeError, match="intrinsics"):
+        solver(*three, cameras(p.intrinsics[:2]))
 
 
 def test_poses_as_elements_of_kornias_group(make_problems):
@@ -42,9 +45,8 @@ def test_cameras_at_a_pose_project_as_we_do(make_problems):
     p = make_problems(n=9, batch=5, noise=False)
     for intrinsics in (p.intrinsics, cameras(p.intrinsics)):
         camera = p.pose.camera(intrinsics, height=480, width=640)
-        torch.testing.assert_close(
-            camera.project(p.world_points[:, :1])[:, 0], p.img_points[:, 0], rtol=1e-9, atol=1e-6
-        )
+        seen = camera.project(p.world_points[:, :1])[:, 0]
+        torch.testing.assert_close(seen, p.img_points[:, 0], rtol=1e-9, atol=1e-6)
         assert camera.extrinsics.equal(p.pose.matrix)
     assert camera.height.tolist() == [7.0] * 5  # that of the camera that came
     shared = p.pose.camera(p.intrinsics[0], height=480, width=640)
@@ -72,15 +74,6 @@ def test_solve_pnp_marks_what_it_cannot_solve(make_problems):
     matrix[..., 3].nansum().backward()
     assert pixels.grad.isfinite().all()
     assert (pixels.grad.abs().sum((1, 2)) > 0).tolist() == [True, False, True, True]
-
-
-def test_one_camera_serves_three_problems(make_problems):
-    """Its matrix has as many rows as there are problems."""
-    p = make_problems(n=9, batch=3)
-    solver = create_solver("epnp")
-    assert solver(*p[:2], cameras(p.intrinsics[:1])).matrix.equal(solver(*p[:2], p.intrinsics[0]).matrix)
-    with pytest.raises(ShapeError, match="intrinsics"):
-        solver(*p[:2], cameras(p.intrinsics[:2]))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -11,18 +11,8 @@ from hypothesis import strategies as st
 from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gradcheck
 from strategies import many
 
-from kornia_pnpnet import create_solver
+from kornia_pnpnet import create_solver, data
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.data import (
-    BoxPoints,
-    CameraProblems,
-    DrivePoints,
-    OutlierMix,
-    SceneProblems,
-    SlabPoints,
-    SyntheticProblems,
-    VaryingSize,
-)
 
 SOLVERS = ("pnpnet-set", "pnpnet-n9", "epnp-lm", "reppnp-lm", "p3p-ransac", "identity-lm")
 ALL = [Case(*x) for x in product(SOLVERS, CAMERAS, NOISES, FOCALS, (torch.float64, torch.float32))]
@@ -32,12 +22,9 @@ QUICK = [
     *(Case(name) for name in ("epnp", "reppnp", "net-n9", "net-set", "pnpnet-n6", "ransac-epnp-lm", *PEERS)),
     Case("pnpnet-set", "pixels", "sigma", "unknown"),
     Case("p3p-ransac", focal="unknown", extra="radial"),
-    Case("pnpnet-set", extra="prior"),
-    Case("epnp-lm", "pixels", "covariance", extra="prior"),
     Case("p3p-ransac", extra="confidence"),
-    Case("pnpnet-set", extra="dist"),
     Case("p3p-ransac", "pixels", "sigma", extra="fisheye"),
-    Case("epnp-lm", "pixels", "covariance", extra="dist"),
+    *(Case(*x, extra=y) for x in (["pnpnet-set"], ["epnp-lm", "pixels", "covariance"]) for y in ("prior", "dist")),
     *(Case(name, dtype=torch.float32) for name in PEERS),
 ]
 FEW_GRADIENTS = [Case("identity-lm", *x) for x in ([], ["rig", "covariance"], ["pixels", "sigma", "unknown"])]
@@ -45,21 +32,14 @@ FEW_GRADIENTS += [Case("identity-lm", extra="prior"), Case("identity-lm", focal=
 GRADIENTS = [Case("identity-lm", *x) for x in product(CAMERAS, NOISES, FOCALS)]
 
 
-def params(laws, cases, *marks):
+def params(laws, quick, cases):
+    cases = [*quick, *(x for x in cases if x not in quick)]
     pairs = ((law, case) for case in cases if not case.is_refused for law in laws if applies(law, case))
     for law, case in pairs:
-        yield pytest.param(law, case, id=f"{law.__name__}-{case}", marks=marks)
+        yield pytest.param(law, case, id=f"{law.__name__}-{case}", marks=() if case in quick else pytest.mark.slow)
 
 
-@pytest.mark.parametrize(
-    ("law", "case"),
-    [
-        *params(LAWS, QUICK),
-        *params(LAWS, [x for x in ALL if x not in QUICK], pytest.mark.slow),
-        *params([gradcheck], FEW_GRADIENTS),
-        *params([gradcheck], [x for x in GRADIENTS if x not in FEW_GRADIENTS], pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("law", "case"), [*params(LAWS, QUICK, ALL), *params([gradcheck], FEW_GRADIENTS, GRADIENTS)])
 def test_law(law, case):
     try:
         build(case)
@@ -68,42 +48,33 @@ def test_law(law, case):
     law(case)
 
 
-# --- laws of precision beside those of solvers ----------------------------------------------------------------------
-
-
 @many(60)
 @given(
-    st.sampled_from([None, BoxPoints(), SlabPoints(), DrivePoints()]),
+    st.sampled_from([None, data.BoxPoints(), data.SlabPoints(), data.DrivePoints()]),
     st.integers(4, 15),
     st.integers(0, 1000),
     st.sampled_from([{}, {"count": 2}, {"max_ratio": 0.5, "mismatch_share": 0.5}]),
 )
 def test_both_precisions_see_the_same_problems(points, n, seed, outliers):
-    options = {"n": n, "batch_size": 3, "seed": seed, "outliers": OutlierMix(**outliers)}
+    options = {"n": n, "batch_size": 3, "seed": seed, "outliers": data.OutlierMix(**outliers)}
     if points is None:
-        source, options = SceneProblems, {"scene": make_scene(20, 25), **options}
+        source, options = data.SceneProblems, {"scene": make_scene(20, 25), **options}
     else:
-        source, options = SyntheticProblems, {"points": points, "axis_ratio": 3.0, "known_noise": 1.0, **options}
+        source, options = data.SyntheticProblems, {"points": points, "axis_ratio": 3.0, "known_noise": 1.0, **options}
     single, double = (source(**options, dtype=dtype).batch(seed) for dtype in (torch.float32, torch.float64))
     assert double.world_points.dtype == torch.float64
     assert same(single, map_tensors(lambda x: x.float() if x.is_floating_point() else x, double))
 
 
-# --- PyTorch's defaults -----------------------------------------------------------------------------------------------
-
-EVERY_KIND = OutlierMix(
+EVERY_KIND = data.OutlierMix(
     max_ratio=0.5, mismatch_share=0.3, structured_share=0.5, near_share=0.2, crowd_share=0.3, point_crowd_share=0.5
 )
+SOURCES = [data.SyntheticProblems(n=9, batch_size=4, outliers=EVERY_KIND)]
+SOURCES += [data.CameraProblems(n=9, batch_size=4, cameras=3)]
+SOURCES += [data.VaryingSize(data.SyntheticProblems, n=[5, 9], batch_size=4)]
 
 
-@pytest.mark.parametrize(
-    "source",
-    [
-        SyntheticProblems(n=9, batch_size=4, outliers=EVERY_KIND),
-        CameraProblems(n=9, batch_size=4, cameras=3),
-        VaryingSize(SyntheticProblems, n=[5, 9], batch_size=4),
-    ],
-)
+@pytest.mark.parametrize("source", SOURCES)
 def test_problems_do_not_depend_on_defaults(source):
     expected = source.batch(1)
     with other_defaults(torch.float64):
@@ -112,7 +83,7 @@ def test_problems_do_not_depend_on_defaults(source):
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])
 def test_built_solvers_do_not_depend_on_the_default_dtype(name):
-    problems = SyntheticProblems(n=12, batch_size=3, seed=1).batch(0)
+    problems = data.SyntheticProblems(n=12, batch_size=3, seed=1).batch(0)
     expected = create_solver(name)(*problems[:3])
     with other_defaults(torch.float64, "cpu"):
         assert_same(create_solver(name)(*problems[:3]), expected)

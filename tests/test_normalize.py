@@ -22,9 +22,6 @@ def residuals(pose, problem):
     return project(State.of(pose), problem).residual.permute(2, 1, 0)
 
 
-# --- poses and cameras ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 @pytest.mark.parametrize("f_const", [1.0, F_CONST])
 @pytest.mark.parametrize(("fx", "fy", "cx", "cy"), [(800, 1200, 0, 0), (3000, 2000, 2016.5, -7.25), (1, 1, 0.5, 0.5)])
@@ -33,9 +30,8 @@ def test_poses_go_to_the_frame_of_the_points_and_back_for_any_camera(fx, fy, cx,
     p = make_problems(outliers=2)
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=DOUBLE).expand(7, 3, 3)
     rays = p.img_points / p.intrinsics[:, 0, 0, None, None]
-    problem, frame = Normalize(f_const=f_const, **options)(
-        p.world_points, denormalize_points_with_intrinsics(rays, K), K
-    )
+    img_points = denormalize_points_with_intrinsics(rays, K)
+    problem, frame = Normalize(f_const=f_const, **options)(p.world_points, img_points, K)
     cam = transform_points(p.pose.matrix, p.world_points)
     pixels, expected = f_const * rays, f_const * (cam[..., :2] / cam[..., 2:] - rays)
     if frame.order is not None:
@@ -72,9 +68,6 @@ def test_the_unit_of_the_world_changes_neither_values_nor_gradients(power, dtype
     torch.testing.assert_close(*outcomes, rtol=0, atol=0)
 
 
-# --- validity ---------------------------------------------------------------------------------------------------------
-
-
 @both_dtypes
 @pytest.mark.parametrize("offset", [0.0, 1.0, 1e4])
 @pytest.mark.parametrize("n", [3, 9, 50])
@@ -104,9 +97,6 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
     for shape, offset, unit in itertools.product(shapes, (0.0, 10.0), (1e-3, 1.0, 1e3)):
         points = unit * ((world * torch.tensor(shape, dtype=DOUBLE)) @ turn.mT + offset)
         assert Normalize()(points.to(dtype), pixels, K)[1].valid.all(), (shape, offset, unit)
-
-
-# --- views ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", [True, False])

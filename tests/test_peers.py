@@ -16,6 +16,7 @@ from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, PeerPose, Pee
 pytest.importorskip("cv2")
 
 ROBUST = tuple(name for name in PEERS if name not in OPENCV)
+FEW = {"min_iterations": 2, "max_iterations": 4}
 
 
 def make(name: str, **options) -> PeerSolver:
@@ -63,8 +64,7 @@ def test_cost_is_the_mean_squared_error_truncated_at_the_threshold(name, make_pr
 
 
 def test_refining_keeps_the_ransac_pose_as_init(make_problems):
-    problems = make_problems(batch=30)
-    rough, fine = (OpenCVRansac(refine=x)(*problems[:3]) for x in (False, True))
+    rough, fine = (OpenCVRansac(refine=x)(*make_problems(batch=30)[:3]) for x in (False, True))
     torch.testing.assert_close(rough.pose, rough.init)
     torch.testing.assert_close(fine.init, rough.pose)
     assert not torch.equal(fine.rotation, fine.init.rotation)
@@ -93,9 +93,6 @@ def test_too_few_pairs_and_a_skew_fail_without_an_error(make_problems):
     skewed.intrinsics[2, 0, 1] = 5.0
     assert OpenCVRansac()(*skewed[:3]).ok.tolist() == [True, True, False, True]
     assert not OpenCVRansac()(*make_problems(n=3, batch=4)[:3]).ok.any()
-
-
-FEW = {"min_iterations": 2, "max_iterations": 4}
 
 
 @pytest.mark.parametrize(

@@ -55,11 +55,7 @@ def count(solver: nn.Module, p: Problems, limit: float, dtype: torch.dtype = tor
 
 
 def opencv_scenes(kind: str, n: int, seed: int, batch: int = 100) -> Problems:
-    """Random clouds, planes in space or square tags; focal lengths and principal point in (0.001, 100) px.
-
-    Points and pixels are rounded to float32, as in OpenCV's suite. Scenes with points behind the camera, which the
-    suite keeps, are left out.
-    """
+    """Clouds, planes in space or square tags, rounded to float32 as in OpenCV's suite, all in front of the camera."""
     generator, drawn = torch.Generator().manual_seed(seed), 40 * batch
 
     def uniform(*shape: int) -> Tensor:
@@ -80,7 +76,7 @@ def opencv_scenes(kind: str, n: int, seed: int, batch: int = 100) -> Problems:
         world = corners * (0.01 + 0.99 * uniform(1, 1)) / 2
     world = world.float().double()
     intrinsics = torch.eye(3, dtype=torch.float64).repeat(drawn, 1, 1)
-    intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = 1e-3 + 99.999 * uniform(4)
+    intrinsics[:, (0, 1, 0, 1), (0, 1, 2, 2)] = 1e-3 + 99.999 * uniform(4)  # pixels
     rotation, translation = poses()
     img = project(world, rotation, translation, intrinsics).float().double()
     seen = ((world @ rotation.mT + translation[:, None])[..., 2] > 0).all(-1).nonzero()[:batch, 0]
@@ -91,13 +87,11 @@ def opencv_scenes(kind: str, n: int, seed: int, batch: int = 100) -> Problems:
 @pytest.mark.parametrize("name", OURS)
 @pytest.mark.parametrize(("kind", "n"), [("cloud", 100), ("plane", 30), ("tag", 4)])
 def test_opencv_scenes_without_outliers(kind, n, name, dtype):
-    """OpenCV's ``CV_solvePnP_Test``: random clouds, planes and tags; at least 70 % must be solved.
-
-    Rounded pixels decide about the last 3 % at 1e-6, where OpenCV minimises pixels and we minimise angles.
-    """
+    """OpenCV's ``CV_solvePnP_Test``: random clouds, planes and tags; at least 70 % must be solved."""
     p = opencv_scenes(kind, n, seed=1)
     methods = {"cloud": ("ITERATIVE", "EPNP"), "plane": ("ITERATIVE", "IPPE", "EPNP"), "tag": ("IPPE_SQUARE", "IPPE")}
     best = max(count(OpenCVPnP(method=method), p, LIMIT[dtype]) for method in (*methods[kind], "SQPNP"))
+    # Rounded pixels decide about the last 3 %, where OpenCV minimises pixels and we minimise angles.
     assert count(create_solver(name), p, LIMIT[dtype], dtype) >= max(70, best - 3)
 
 
@@ -227,11 +221,9 @@ def test_status_names_the_reason(name, dtype):
     p.img_points[4] = 3400.0 * (2.0 * torch.rand(20, 2, generator=torch.Generator().manual_seed(2)) - 1.0)
     p.intrinsics[5, :2, :2] *= 1e-7  # pixels 89.99 degrees off the axis
     p.world_points[6] += 1e6 if dtype == torch.float32 else 1e15
-    reasons = (Status.TOO_FEW_PAIRS, Status.DEGENERATE, Status.NOT_FINITE, Status.CAMERA, Status.NOT_BELIEVED)
-    reasons = (*reasons, Status.CAMERA, Status.PRECISION)
+    reasons = ["TOO_FEW_PAIRS", "DEGENERATE", "NOT_FINITE", "CAMERA", "NOT_BELIEVED", "CAMERA", "PRECISION", "SOLVED"]
     result = solve(create_solver(name), p, dtype, mask=mask)
-    assert [Status(x) for x in result.status.tolist()] == [*reasons, Status.SOLVED]
-    assert torch.equal(result.ok, result.status == Status.SOLVED)
+    assert [Status(x).name for x in result.status.tolist()] == reasons
     assert all(x.isfinite().all() for x in result.pose)
 
 

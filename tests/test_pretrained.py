@@ -1,19 +1,27 @@
-"""The shipped weights: the success they must reach, and model cards made from the results of their run."""
+"""The shipped weights, the success they must reach, and the files, cards and summaries of the results of runs."""
 
+import hashlib
+import json
 import math
 import shutil
+from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
 from helpers import rate
+from hypothesis import given
 from kornia.core.exceptions import ValueCheckError
+from strategies import many, names_the_file, places_in, spoiled
 
 from kornia_pnpnet import PnPNet, create_solver, shipped_weights
+from kornia_pnpnet.core.files import digest, write_json
+from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, read_weights, write_weights
 from kornia_pnpnet.training.card import write_model_card
-from kornia_pnpnet.training.results import load_run
+from kornia_pnpnet.training.results import find_results, load_run, summarize_runs
 
 # Success without outliers and with a random number of outliers: about two points below what the training run found.
 FLOORS = {6: (0.67, 0.53), 9: (0.85, 0.77), 12: (0.92, 0.87), 20: (0.97, 0.95)}
@@ -31,12 +39,9 @@ SET_FLOORS = {6: (0.71, 0.55), 9: (0.88, 0.79), 12: (0.94, 0.89), 20: (0.98, 0.9
 )
 def test_success_on_problems_that_nothing_else_uses(name, n, floors, dtype):
     common = {"n": n, "batch_size": 4000, "dtype": dtype} | ({"max_angle": math.pi} if name == "pnpnet-set" else {})
-    sources = (
-        SyntheticProblems(seed=555_001, **common),
-        SyntheticProblems(seed=555_002, outliers=OutlierMix(), **common),
-    )
-    solver, sound = create_solver(name), sources[0].batch(0)
-    for problems, floor in zip((sound, sources[1].batch(0)), floors, strict=True):
+    solver, sound = create_solver(name), SyntheticProblems(seed=555_001, **common).batch(0)
+    mixed = SyntheticProblems(seed=555_002, outliers=OutlierMix(), **common).batch(0)
+    for problems, floor in zip((sound, mixed), floors, strict=True):
         assert rate(solver(*problems[:3]), problems) >= floor
     if name != "pnpnet-set":
         assert rate(create_solver(f"net-n{n}")(*sound[:3]), sound) < floors[0] / 2
@@ -48,11 +53,8 @@ def test_success_on_problems_that_nothing_else_uses(name, n, floors, dtype):
 
 @pytest.mark.parametrize("name", ["no-such-name", "", "a/b/c"])
 def test_an_unknown_name_is_an_error_that_lists_the_shipped_weights_without_a_network(name, monkeypatch):
-    def connect(*_):
-        raise AssertionError("a connection was opened")
-
-    monkeypatch.setattr("socket.socket.connect", connect)
-    monkeypatch.setattr("socket.getaddrinfo", connect)
+    for target in ("socket.socket.connect", "socket.getaddrinfo"):
+        monkeypatch.setattr(target, lambda *_: pytest.fail("a connection was opened"))
     with pytest.raises(FileNotFoundError) as raised:
         PnPNet.from_pretrained(name)
     assert all(shipped in str(raised.value) for shipped in shipped_weights())
@@ -104,3 +106,69 @@ def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, 
     write_weights(tmp_path, config, {**state, "pair.bias": torch.full((4,), torch.nan)})
     with pytest.raises(ValueCheckError, match=r"not finite: pair\.bias"):
         PnPNet.from_pretrained(tmp_path)
+
+
+def test_digests_tell_contents_apart():
+    """For any dtype, layout and order of keys."""
+    x = torch.arange(6.0).reshape(2, 3)
+    assert digest("a", b"b") == hashlib.sha256(b"ab").hexdigest()
+    assert digest({"a": 1, "b": [2]}) == digest({"b": [2], "a": 1})
+    assert digest(x.mT.contiguous().mT.requires_grad_()) == digest(x)
+    others = (x.reshape(3, 2), x.double(), x.bfloat16(), x > 2, x + 1, x.int(), x.new_zeros(0), torch.tensor(1.0))
+    assert len({digest(tensor) for tensor in (x, *others)}) == 1 + len(others)
+
+
+@pytest.mark.parametrize(("content", "error"), [({"a": float("nan")}, ValueError), ([1, object()], TypeError)])
+def test_content_that_json_does_not_have_leaves_the_old_file(tmp_path, content, error):
+    path = tmp_path / "folder" / "a.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(error):
+        write_json(path, content)
+    assert json.loads(path.read_text()) == {"a": 1}
+    assert [*path.parent.iterdir()] == [path]
+
+
+def test_a_card_names_no_folder_of_a_machine(tmp_path):
+    results = load_run(WEIGHTS_FOLDER / "pnpnet-n9" / "results.json")
+    overrides = ["train.ramp=[0,0]", "weights=/tmp/runs/mine", "weights=~/runs/mine", r"weights=C:\runs\mine"]
+    overrides += ["weights=file:///runs/mine", "+data.scenes=[/runs/mine/a,'/runs/mine b']", "data={path:/runs/mine}"]
+    overrides += ["url=https://host/a", "weights=outputs/a/weights"]
+    for origin in (results.origin, None):
+        write_model_card(tmp_path, replace(results, overrides=overrides, origin=origin))
+        card = (tmp_path / "README.md").read_text()
+        assert not any(word in card for word in ("/runs", "mine"))
+        assert "train.ramp=[0,0]" in card
+        assert "url=https://host/a weights=outputs/a/weights" in card
+
+
+def test_spoiled_results_of_runs_are_an_error_of_ours(tmp_path):
+    weights = tmp_path / "run" / "weights"
+    shutil.copytree(WEIGHTS_FOLDER / "pnpnet-n6", weights)
+    path = (weights / "results.json").rename(tmp_path / "run" / "results.json")
+    content = json.loads(path.read_text())
+    places, outcomes = list(places_in(content)), Counter()
+
+    @many(150)
+    @given(spoiled(content, places))
+    def run(results):
+        path.write_text(json.dumps(results))
+        card = tmp_path / "README.md"
+        card.unlink(missing_ok=True)
+        try:
+            loaded = load_run(path)
+            write_json(tmp_path / "again.json", to_json(loaded))
+            assert find_results(weights) == loaded == load_run(tmp_path / "again.json")
+        except ValueError as error:
+            outcomes["refused"] += 1
+            names_the_file(error, path)
+            with pytest.warns(UserWarning, match="Left out of the summary"):
+                assert summarize_runs(tmp_path) is None
+        else:
+            outcomes["works"] += 1
+            write_model_card(tmp_path, loaded)
+            assert card.stat().st_size > 1000
+            assert summarize_runs(tmp_path).read_text().count("\n") >= 2
+            (tmp_path / "summary.csv").unlink()
+
+    run()
+    assert min(outcomes["refused"], outcomes["works"]) >= 5

@@ -1,33 +1,211 @@
-"""Laws of RANSAC: how samples are drawn and poses scored, and that the pose and its inliers are found."""
+"""Laws of P3P: all solutions and nothing else; of RANSAC: samples, scores, and that pose and inliers are found."""
 
 import itertools
 import math
 
 import pytest
 import torch
+from strategies import are_rotations, finite
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver, pose_errors
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.judge.inliers import Thresholds, judge
-from kornia_pnpnet.problem import State
-from kornia_pnpnet.propose.p3p import P3P
+from kornia_pnpnet.problem import Hypotheses, Problem, State
+from kornia_pnpnet.propose.p3p import P3P, p3p
+from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.ransac import RANSAC
-from kornia_pnpnet.propose.sampling import (
-    Samples,
-    agreement_of_neighbours,
-    draw,
-    samples_needed,
-)
+from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, draw, samples_needed
 from kornia_pnpnet.propose.scoring import Scene, as_pose
 from kornia_pnpnet.propose.search import Search
 from kornia_pnpnet.refine.residual import project
 
-# --- samples ----------------------------------------------------------------------------------------------------------
+DTYPES = (torch.float64, torch.float32)
+NEAR = 1e-6
 
 
-@pytest.mark.parametrize(
-    "chances", [[0.5, 0.2, 0.0, 0.2, 0.1], [0.2] * 5 + [0.0]], ids=["some are likelier", "all are equally likely"]
-)
+def rotations(batch, seed):
+    return random_poses(batch, torch.Generator().manual_seed(seed), max_angle=math.pi).rotation
+
+
+def seen(cam_points, generator):
+    """World points and plane points of points in the camera frame, and the pose, which is anywhere."""
+    rotation = rotations(len(cam_points), seed=77)
+    translation = torch.randn(len(cam_points), 3, generator=generator, dtype=torch.float64)
+    world_points = (cam_points - translation[:, None]) @ rotation
+    return world_points, cam_points[..., :2] / cam_points[..., 2:], Pose(rotation, translation)
+
+
+def wide(batch, seed=0):
+    """A field of view of 90 degrees, depths from 0.1 to 10."""
+    generator = torch.Generator().manual_seed(seed)
+    xy, z = torch.rand(batch, 3, 3, generator=generator, dtype=torch.float64).split((2, 1), -1)
+    return seen(torch.cat((2.0 * xy - 1.0, torch.ones_like(z)), -1) * (0.1 + 9.9 * z), generator)
+
+
+def protocol(batch, seed=0):
+    """The package's own problems without noise."""
+    exact = {"img_sigma": 0.0, "world_sigma": 0.0, "dtype": torch.float64}
+    p = SyntheticProblems(n=3, batch_size=batch, seed=seed, **exact).batch(0)
+    return p.world_points, p.img_points / p.intrinsics[:, :1, :1], p.pose
+
+
+def tele(batch, seed=0):
+    """Points around one that is a hundred times as far away."""
+    generator = torch.Generator().manual_seed(seed)
+    centre = torch.tensor([20.0, -10.0, 100.0], dtype=torch.float64)
+    return seen(centre + torch.randn(batch, 3, 3, generator=generator, dtype=torch.float64), generator)
+
+
+SCENES = {"wide": wide, "protocol": protocol, "tele": tele}
+
+
+def errors(found, pose):
+    """Largest error of an entry of the rotation plus relative error of the translation, (B, S), infinite if invalid."""
+    rotation = (found.pose.rotation - pose.rotation[:, None]).abs().amax((-1, -2))
+    translation = (found.pose.translation - pose.translation[:, None]).norm(dim=-1)
+    return torch.where(found.valid, rotation + translation / pose.translation.norm(dim=-1)[:, None], torch.inf)
+
+
+def in_camera(found, world_points):
+    """The points in the camera frame of each solution, (B, S, 3, 3)."""
+    return torch.einsum("bsij,bnj->bsni", found.pose.rotation, world_points) + found.pose.translation[:, :, None]
+
+
+def reprojection_errors(found, world_points, plane_points, rig=None):
+    """The largest error of each valid solution; infinite behind the camera."""
+    cam_points = in_camera(found, world_points)
+    if rig is not None:
+        cam_points = torch.einsum("bnij,bsnj->bsni", rig.rotation, cam_points) + rig.translation[:, None]
+    error = (cam_points[..., :2] / cam_points[..., 2:] - plane_points[:, None]).norm(dim=-1).amax(-1)
+    return torch.where((cam_points[..., 2] > 0).all(-1), error, torch.inf)[found.valid]
+
+
+def assert_same_solutions(found, expected, tolerance=NEAR):
+    """Each solution of one is a solution of the other."""
+    assert torch.equal(found.valid.sum(-1), expected.valid.sum(-1))
+    matrix, other = (torch.cat((h.pose.rotation, h.pose.translation[..., None]), -1) for h in (found, expected))
+    apart = (matrix[:, :, None] - other[:, None]).abs().amax((-1, -2))  # (B, S, S)
+    apart = torch.where(expected.valid[:, None], apart, torch.inf)
+    assert (apart.amin(-1)[found.valid] < tolerance).all()
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_the_true_pose_is_among_the_solutions_and_all_of_them_are_solutions(scene):
+    world_points, plane_points, pose = scene(20_000)
+    found = p3p(world_points, plane_points)
+    assert (errors(found, pose).amin(-1) < NEAR).all()
+    assert (reprojection_errors(found, world_points, plane_points) < 1e-9).all()
+    rotation = found.pose.rotation[found.valid]
+    assert (rotation @ rotation.mT - torch.eye(3)).abs().max() < 1e-11
+    assert (torch.linalg.det(rotation) > 0).all()
+
+
+def test_there_are_one_to_four_solutions_and_no_two_are_the_same():
+    found = p3p(*wide(20_000)[:2])
+    counts = torch.bincount(found.valid.sum(-1))
+    assert counts[0] == 0
+    assert (counts[1:] > 100).all()
+    apart = (found.pose.rotation[:, :, None] - found.pose.rotation[:, None]).abs().amax((-1, -2))
+    apart = torch.where(found.valid[:, :, None] & found.valid[:, None] & ~torch.eye(4, dtype=torch.bool), apart, 1.0)
+    assert apart.min() > NEAR
+
+
+def test_order_frame_and_unit_of_the_points_do_not_matter(generator):
+    world_points, plane_points, _ = wide(5000)
+    expected = p3p(world_points, plane_points)
+    for order in ((1, 2, 0), (1, 0, 2), (2, 1, 0)):
+        assert_same_solutions(p3p(world_points[:, order], plane_points[:, order]), expected)
+    turn, shift = rotations(5000, seed=1), torch.randn(5000, 3, generator=generator, dtype=torch.float64)
+    for scale in (1e-12, 1e12):
+        found = p3p(scale * (world_points @ turn.mT + shift[:, None]), plane_points)
+        # x_cam = R' s (Q x + c) + t' is s times R' Q x + R' c + t' / s
+        rotation = found.pose.rotation @ turn[:, None]
+        moved = (found.pose.rotation @ shift[:, None, :, None])[..., 0] + found.pose.translation / scale
+        assert_same_solutions(Hypotheses(Pose(rotation, moved), found.valid), expected)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_symmetric_scene_whose_cubic_has_its_roots_at_zero_and_infinity(dtype):
+    # An equilateral triangle seen from its axis: one pose upright, and three poses from the side.
+    angle = torch.tensor([0.0, 2.0, 4.0], dtype=dtype) * math.pi / 3.0
+    world_points = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)[None]
+    cam_points = world_points + torch.tensor([0.0, 0.0, 4.0], dtype=dtype)
+    found = p3p(world_points, cam_points[..., :2] / cam_points[..., 2:])
+    assert found.valid.all()
+    upright = Pose(torch.eye(3, dtype=dtype)[None], torch.tensor([[0.0, 0.0, 4.0]], dtype=dtype))
+    assert errors(found, upright).min() < 100.0 * torch.finfo(dtype).eps
+    assert (found.pose.rotation[..., 2, 2] < 0.99).sum() == 3
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-12, 1e-6])
+def test_two_solutions_that_meet_are_not_lost(offset, generator):
+    # They meet where the camera is on the cylinder upright on the circle through the points.
+    angles = 2.0 * math.pi * torch.rand(5000, 4, generator=generator, dtype=torch.float64)
+    circle = torch.stack((angles.cos(), angles.sin(), torch.zeros_like(angles)), -1)
+    centre = circle[:, 3] + torch.tensor([offset, 0.0, 2.0])
+    axis3 = torch.nn.functional.normalize(-centre, dim=-1)
+    axis1 = torch.nn.functional.normalize(torch.linalg.cross(circle[:, 0].roll(1, -1) + 0.1, axis3), dim=-1)
+    rotation = torch.stack((axis1, torch.linalg.cross(axis3, axis1), axis3), -2)
+    cam_points = (circle[:, :3] - centre[:, None]) @ rotation.mT
+    edges = (circle[:, :3] - circle[:, :3].roll(1, 1)).norm(dim=-1).amin(-1)
+    cam_points = cam_points[edges > 0.2]  # short edges would lose digits
+    world_points, plane_points, pose = seen(cam_points, generator)
+    found = p3p(world_points, plane_points)
+    assert found.valid.any(-1).all()
+    assert (errors(found, pose).amin(-1) < 1e-5).all()
+    assert (errors(found, pose).amin(-1) < NEAR).double().mean() > 0.98
+    assert (reprojection_errors(found, world_points, plane_points) < 1e-9).all()
+
+
+@pytest.mark.parametrize("unit", [2.0**-90, 2.0**90])
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_single_precision_solves_what_it_can(scene, unit):
+    world_points, plane_points, pose = scene(20_000)
+    found = p3p(unit * world_points.float(), plane_points.float())
+    assert found.pose.rotation.dtype == torch.float32
+    finite(found)
+    error = (found.pose.rotation - pose.rotation[:, None]).abs().amax((-1, -2))
+    error = torch.where(found.valid, error, torch.inf).amin(-1)
+    assert error.quantile(0.5) < 1e-5
+    assert error.quantile(0.99) < 1e-3
+    assert (error < 0.01).double().mean() > 0.999
+    assert (found.valid.sum(-1) == p3p(world_points, plane_points).valid.sum(-1)).double().mean() > 0.99
+
+
+@pytest.mark.parametrize("base", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize("looks", ["ahead", "everywhere"])
+def test_three_pairs_of_a_rig(base, looks, generator):
+    world_points, plane_points, pose = wide(5000)
+    turns = rotations(15_000, seed=5).view(5000, 3, 3, 3) if looks == "everywhere" else torch.eye(3).double()
+    rig = Pose(turns.expand(5000, 3, 3, 3), base * torch.randn(5000, 3, 3, generator=generator, dtype=torch.float64))
+    in_camera_of_pair = in_camera(Hypotheses(Pose(*(x[:, None] for x in pose)), None), world_points)[:, 0]
+    in_rig = (rig.rotation.mT @ (in_camera_of_pair - rig.translation)[..., None])[..., 0]
+    world_points = (in_rig - pose.translation[:, None]) @ pose.rotation
+    found = P3PRig().hypotheses(Problem.of(world_points, plane_points, rig=rig))
+    assert (errors(found, pose).amin(-1) < NEAR).double().mean() > 0.95
+    gap = reprojection_errors(found, world_points, plane_points, rig)
+    assert (gap < 1e-3).all()
+    assert (gap < 1e-9).double().mean() > 0.98
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_numbers_that_make_no_sense_have_finite_solutions(dtype):
+    values = torch.tensor([0.0, -1.0, 1e30, torch.inf, -torch.inf, torch.nan])
+    points = [x.to(dtype) for x in wide(36)[:2]]
+    points[0][:, 0, 0], points[1][:, 1, 1] = values.repeat(6), values.repeat_interleave(6)
+    found = p3p(*points)
+    are_rotations(found.pose.rotation[found.valid])
+    finite(found)
+
+
+# --- RANSAC -----------------------------------------------------------------------------------------------------------
+
+#: Thresholds for the noise of the protocol: 1 px and 0.05 m.
+PROTOCOL = {"threshold": 6.0, "world_threshold": 0.3}
+
+
+@pytest.mark.parametrize("chances", [[0.5, 0.2, 0.0, 0.2, 0.1], [0.2] * 5 + [0.0]], ids=["unequal", "equal"])
 @pytest.mark.parametrize("size", [1, 3])
 def test_items_are_drawn_by_their_chances_and_none_twice(size, chances, generator):
     """Items one after the other in proportion to their probabilities among those that are left."""
@@ -104,23 +282,21 @@ def test_the_number_of_samples_has_the_confidence(size):
     assert samples_needed(torch.tensor([0]), torch.tensor([0]), size, 0.999).item() == math.inf
 
 
-# --- scores -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("of_pairs", [False, True])
 @pytest.mark.parametrize("in_world", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_errors_without_division_are_the_textbooks(of_pairs, in_world, dtype, make_problems, correspond, perturb):
+def test_errors_without_division_are_the_textbooks(of_pairs, in_world, dtype, make_problems, perturb):
     """Squared residual over squared threshold of ten poses of each problem, infinite behind the camera."""
-    problem, truth = correspond(make_problems(9, 7, outliers=2))
+    p = make_problems(9, 7, outliers=2)
+    problem, frame = Normalize(order=False)(*p[:3])
+    truth = frame.apply(p.pose)
     poses = [perturb(truth, angle=0.3 * i, shift=0.4 * i, seed=i) for i in range(10)]
     tau = torch.linspace(5.0, 50.0, 7, dtype=torch.float64)[:, None]
     omega = tau / 500 * in_world
     tau = tau * torch.linspace(0.2, 3.0, 9, dtype=torch.float64) if of_pairs else tau
     thresholds = Thresholds(tau, omega)
-    scene = Scene.of(problem, thresholds, dtype)
-    entries = [torch.cat((pose.rotation, pose.translation[..., None]), -1).flatten(1) for pose in poses]
-    errors = scene.errors(torch.stack(entries, -1).to(dtype)).double()  # (P, N, H)
+    entries = torch.stack([pose.matrix[:, :3].flatten(1) for pose in poses], -1)
+    errors = Scene.of(problem, thresholds, dtype).errors(entries.to(dtype)).double()  # (P, N, H)
     behind = 0
     for h, pose in enumerate(poses):
         cam = problem.world_points @ pose.rotation.mT + pose.translation[:, None]
@@ -140,13 +316,6 @@ def test_errors_without_division_are_the_textbooks(of_pairs, in_world, dtype, ma
     assert behind > 10  # the test has seen them
 
 
-# --- the search -------------------------------------------------------------------------------------------------------
-
-
-#: Thresholds for the noise of the protocol: 1 px and 0.05 m.
-PROTOCOL = {"threshold": 6.0, "world_threshold": 0.3}
-
-
 def solver(minimal=None, **options):
     return PnPNet(RANSAC(P3P() if minimal is None else minimal, **options), RobustWeightedLM(m=0, robustness=0))
 
@@ -155,9 +324,7 @@ def solver(minimal=None, **options):
 def test_exact_recovery_among_outliers(n, outliers, scorer, make_problems):
     problems = make_problems(n, 20, outliers=outliers, noise=False)
     result = solver(threshold=1.0, scorer=scorer)(*problems[:3])
-    errors = pose_errors(result.pose, problems.pose)
-    assert errors.rotation_error_deg.max() < 1e-9
-    assert errors.translation_error.max() < 1e-9
+    assert max(x.max() for x in pose_errors(result.pose, problems.pose)) < 1e-9
     assert result.ok.all()
     # An outlier may fall on the right place by chance; an inlier is never missed.
     assert (result.weights > 0)[problems.inliers].all()
@@ -192,11 +359,10 @@ def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
             assert solver(**options)(*problems[:3]).ok.double().mean() <= 0.01
 
 
-def test_the_gradient_is_that_of_the_result(make_problems, correspond):
+def test_the_gradient_is_that_of_the_result(make_problems, generator):
     """The start is so near the minimum that a constant start costs little."""
-    corr, _ = correspond(make_problems(12, 4, outliers=4))
+    corr, _ = Normalize(order=False)(*make_problems(12, 4, outliers=4)[:3])
     ransac = RANSAC(P3P(), threshold=20.0)
-    generator = torch.Generator().manual_seed(0)
     probe = torch.randn(4, 3, generator=generator, dtype=torch.float64)
     # Without a threshold in the world all inliers weigh 1. The start is found in float32: smaller steps show rounding.
     for name, step in (("img_points", 1e-2), ("world_points", 1e-4), ("weights", 1e-2)):
@@ -220,8 +386,6 @@ def test_rivals_are_more_accurate_if_the_noise_exceeds_the_threshold():
     limit = 3.0 * problem.img_scale[:, None]
     search = Search(ransac, problem, Thresholds(limit, torch.zeros_like(limit)), finds_rivals=True)
     search.run()
-    errors = [
-        pose_errors(frame.undo(as_pose(x)), problems.pose).rotation_error_deg.median()
-        for x in (search.poses, search.rivals)
-    ]
-    assert errors[1] < 0.9 * errors[0]
+    poses = [frame.undo(as_pose(x)) for x in (search.poses, search.rivals)]
+    best, rival = (pose_errors(pose, problems.pose).rotation_error_deg.median() for pose in poses)
+    assert rival < 0.9 * best

@@ -26,11 +26,8 @@ DEADLINE = 1200  # seconds; starting Ray takes minutes on a busy machine
 
 #: Runs the example on two nodes with one core each.
 SCRIPT = f"""
-import signal
-import sys
-
-import ray
-import ray_data
+import signal, sys
+import ray, ray_data
 from ray.cluster_utils import Cluster
 from workers import Watched
 
@@ -48,15 +45,11 @@ cluster.shutdown()
 #: Notes the rows of each call. In its third call a worker is killed once where there is a file "die", and waits for as
 #: long as there is a file "wait".
 WORKERS = """
-import os
-import signal
-import time
+import os, signal, time
 from pathlib import Path
-
 from kornia_pnpnet.arrow import Solve
 
 HERE = Path(__file__).parent
-
 
 class Watched(Solve):
     calls = 0
@@ -98,10 +91,6 @@ def start(tmp_path):
         process.wait()
 
 
-def rows_of_calls(folder):
-    return sum(int(path.read_text()) for path in (folder / "calls").iterdir())
-
-
 def check_results(folder):
     """Each problem is solved once, and as in one process."""
     found = parquet.read_table(folder / "out").sort_by("id")
@@ -132,7 +121,8 @@ def test_a_stopped_run_goes_on_where_it_was(start, tmp_path):
     for path in (tmp_path / "calls").iterdir():
         path.unlink()
     assert start("id").wait(DEADLINE) == 0
-    assert 0 < rows_of_calls(tmp_path) < FILES * ROWS
+    rows = sum(int(path.read_text()) for path in (tmp_path / "calls").iterdir())
+    assert 0 < rows < FILES * ROWS
     check_results(tmp_path)
     before = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert start("id").wait(DEADLINE) == 0  # nothing is left to do

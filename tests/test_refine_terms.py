@@ -9,6 +9,7 @@ from helpers import derivative, rate, verified_derivative, verify_jacobian
 from torch import nn
 
 from kornia_pnpnet import PnPNet, Pose, PosePrior, RobustWeightedLM, Status, create_solver, gravity_prior
+from kornia_pnpnet.evaluation.named_solvers import load_solver
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine.residual import project, retract
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm
@@ -39,13 +40,6 @@ def informative(problems, generator):
     """An information with correlations between turns and shifts."""
     root = torch.randn(len(problems.world_points), 6, 6, generator=generator, dtype=torch.float64)
     return PosePrior(retract(problems.pose, 0.01 * root[:, 0]), 400.0 * root @ root.mT)
-
-
-def refiner(m):
-    return PnPNet(None, RobustWeightedLM(m, kernel="huber", robustness=1e4, learnable=False))
-
-
-# --- the terms --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -113,14 +107,12 @@ def test_a_camera_term_is_linearised(unknown, state):
     torch.testing.assert_close(linear.residual[:, 0], (focal * state.camera[:, 0].exp() / term.expected).log())
 
 
-# --- solvers ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", [informative, gravity, drawn])
 def test_pose_is_a_minimum_of_the_whole_cost(kind, make_problems, generator):
     p = make_problems(n=8, batch=20)
     prior = kind(p, generator)._replace(scale=torch.full((20,), torch.inf, dtype=torch.float64))
-    state = State.of(refiner(40)(*p[:3], prior=prior, init=p.pose, img_sigma=2.0).pose)
+    solver = PnPNet(None, RobustWeightedLM(40, kernel="huber", robustness=1e4, learnable=False))
+    state = State.of(solver(*p[:3], prior=prior, init=p.pose, img_sigma=2.0).pose)
     problem = Problem.of(p.world_points, p.img_points, p.intrinsics[0, 0, 0])
     term, _ = PoseTerm.of(prior, torch.zeros(20, 3).double(), torch.ones(20).double())
 
@@ -146,8 +138,7 @@ def test_information_beside_a_zero_of_the_diagonal_is_refused_in_every_unit(size
     problems = make_problems(n=9, batch=2, outliers=0)
     information = torch.diag(torch.tensor([100.0, 0.0, 100.0, 0.0, 0.0, 0.0], dtype=torch.float64)).repeat(2, 1, 1)
     information[0, 4, 3] = 1e-5 / size**2
-    pose = Pose(problems.pose.rotation, size * problems.pose.translation)
-    prior = PosePrior(pose, information)
+    prior = PosePrior(Pose(problems.pose.rotation, size * problems.pose.translation), information)
     result = create_solver("epnp-lm")(size * problems.world_points, *problems[1:3], prior=prior)
     assert result.status.tolist() == [Status.NOT_FINITE, Status.SOLVED]
 
@@ -167,14 +158,11 @@ def test_what_is_known_helps_and_what_is_wrong_hardly_harms(make_problems, gener
         assert found(nine, kind(nine, generator, wrong)) > alone - 0.03
 
 
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [("pnpnet-set", {"effort": "fixed"}), ("pnpnet-set", {"effort": "adaptive"}), ("p3p-ransac", {"threshold": 10.0})],
-)
-def test_gravity_chooses_among_poses(name, options, make_problems, generator):
+@pytest.mark.parametrize("name", ["pnpnet-set:effort=fixed", "pnpnet-set:effort=adaptive", "p3p-ransac:threshold=10.0"])
+def test_gravity_chooses_among_poses(name, make_problems, generator):
     """Of four pairs with one outlier, three decide: gravity tells their poses apart."""
     problems = make_problems(n=4, batch=500, outliers=1)
-    solver = create_solver(name, **options)
+    solver = load_solver(name)
     found = [solver(*problems[:3], prior=x, **SIGMAS) for x in (None, gravity(problems, generator))]
     assert rate(found[1], problems) > rate(found[0], problems) + 0.02
 
@@ -188,7 +176,7 @@ def test_opposite_directions(generator):
 
 def test_gradients_of_gravity(generator):
     down = torch.randn(3, 1, 3, generator=generator, dtype=torch.float64)
-    inputs = down[0], down[0] + 0.1 * down[1], torch.full((1,), 0.02, dtype=torch.float64)
-    leaves = [x.requires_grad_() for x in inputs]
+    sigma = torch.full((1,), 0.02, dtype=torch.float64)
+    leaves = [x.requires_grad_() for x in (down[0], down[0] + 0.1 * down[1], sigma)]
     relative = lambda *x: (gravity_prior(*x).pose.rotation, 1e-3 * gravity_prior(*x).information)  # noqa: E731
     assert torch.autograd.gradcheck(relative, leaves)

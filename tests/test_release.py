@@ -39,8 +39,7 @@ def test_contents(built):
     assert wanted | {f"kornia_pnpnet/weights/{weights}/{file}" for weights, file in files} <= set(names)
     with tarfile.open(archive) as file:
         inside = {name.partition("/")[2] for name in file.getnames()}
-    paths = {"LICENSE", "CHANGELOG.md", "CITATION.cff", "train.py", "conf/train.yaml", "tests/test_release.py"}
-    assert paths <= inside
+    assert {"LICENSE", "CHANGELOG.md", "CITATION.cff", "train.py", "conf/train.yaml", "tests/test_release.py"} <= inside
     assert not any(name.startswith(("outputs/", "site/", ".venv/", "shared/")) for name in inside)
 
 
@@ -62,9 +61,6 @@ def test_the_quick_start_in_an_empty_environment(built, tmp_path):
     command = python.with_name("pnpnet")
     assert kornia_pnpnet.__version__ in run(command, "--version")
     assert "pnpnet-set" in run(command, "list")
-
-
-# --- types ------------------------------------------------------------------------------------------------------------
 
 
 SCRIPT = """
@@ -100,14 +96,8 @@ def test_a_script_is_typed_and_wrong_arguments_are_found(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT + WRONG)
     options = "--strict", "--follow-imports=silent", "--cache-dir", str(tmp_path / "cache")
-    run = subprocess.run(
-        [sys.executable, "-m", "mypy", *options, script.name],
-        cwd=tmp_path,
-        env={"MYPYPATH": str(Path(__file__).resolve().parents[1])},
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
-    first = (SCRIPT + WRONG).count("\n") - WRONG.count("\n") + 2
+    command, path = [sys.executable, "-m", "mypy", *options, script.name], {"MYPYPATH": str(REPO)}
+    run = subprocess.run(command, cwd=tmp_path, env=path, stdout=subprocess.PIPE, text=True, check=False)
+    first = SCRIPT.count("\n") + 2
     found = re.findall(r"script.py:(\d+): error: .*?(\"\w+\")", run.stdout)
     assert found == [(str(first), '"sigma"'), (str(first + 1), '"img_sigma"'), (str(first + 2), '"PnPResult"')], run

@@ -1,40 +1,43 @@
-"""The training loop: resuming equals not stopping, bad steps are skipped, two processes equal one."""
+"""The training loop and its batches: resuming equals not stopping, two processes equal one, workers draw and end."""
 
 import math
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from types import SimpleNamespace
 
 import pytest
 import torch
+from data_helpers import same
 from helpers import assert_same
 from kornia.core.exceptions import BaseError
 from lightning_fabric import Fabric
 
 from kornia_pnpnet import MLPInit, PnPNet, PoseLoss, RobustWeightedLM
 from kornia_pnpnet.core.files import read_csv
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.data import OutlierMix, SyntheticProblems, VaryingSize
+from kornia_pnpnet.data.stream import stream_batches
 from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError
 
 SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
 
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
-forks = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+pytestmark = forks = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 
 
-def make_parts(updates=6, **changes):
+def make_parts(updates=6, dtype=torch.float32, **changes):
     torch.manual_seed(0)
     settings = {"warmup": 1, "log_every": 1, "validate_every": 3, "checkpoint_every": 2, "ramp": (0.2, 0.5), **changes}
     return {
-        "model": PnPNet(MLPInit(6), RobustWeightedLM(2)),
-        "data": SyntheticProblems(n=6, batch_size=16, seed=3, outliers=OutlierMix()),
-        "validation": {"none": SyntheticProblems(n=6, batch_size=32, seed=4).batch(0)},
+        "model": PnPNet(MLPInit(6), RobustWeightedLM(2)).to(dtype),
+        "data": SyntheticProblems(n=6, batch_size=16, seed=3, outliers=OutlierMix(), dtype=dtype),
+        "validation": {"none": SyntheticProblems(n=6, batch_size=32, seed=4, dtype=dtype).batch(0)},
         "loss": PoseLoss(saturation=0.02),
         "settings": TrainSettings(updates, **settings),
         "progress": False,
@@ -76,7 +79,6 @@ def stopping_loss(at, number):
     return LossWith(stop, at=(at,))
 
 
-@forks
 @pytest.mark.parametrize(
     ("number", "workers", "workers_later"),
     [(signal.SIGTERM, 0, 0), (signal.SIGINT, 1, 0), (signal.SIGINT, 0, 1), (signal.SIGTERM, 1, 1)],
@@ -86,7 +88,6 @@ def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, 
         pytest.skip("os.kill ends the workers")
     whole = make_parts()
     fit(folder=tmp_path / "whole", **whole)
-
     handler = signal.getsignal(number)
     stopped = {**make_parts(), "loss": stopping_loss(3, number)}
     report = fit(folder=tmp_path / "parts", data_workers=workers, **stopped)
@@ -97,7 +98,6 @@ def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, 
     with (tmp_path / "parts" / HISTORY_NAME).open("r+") as file:
         last = file.readlines()[-1]
         file.write(f"4{last[1:]}2")  # a killed run has rows beyond its last checkpoint, and the last row may be cut
-
     again = {**make_parts(), "model": PnPNet(MLPInit(6), RobustWeightedLM(2))}  # other weights at first
     report = fit(folder=tmp_path / "parts", resume=True, data_workers=workers_later, **again)
     assert (report.update, report.interrupted) == (6, False)
@@ -112,7 +112,6 @@ def test_steps_that_are_not_finite_are_skipped_and_counted(tmp_path, value):
     report = fit(folder=tmp_path / "one", **{**parts, "loss": LossWith(lambda: value, at=(1,))})
     assert report.skipped == 1
     assert_same(parts["model"].state_dict(), before.state_dict())
-
     parts = make_parts(updates=5)
     report = fit(folder=tmp_path / "some", **{**parts, "loss": LossWith(lambda: value, at=(2, 4))})
     assert report.skipped == 2
@@ -129,24 +128,24 @@ def test_a_checkpoint_is_continued_by_the_same_run_only(tmp_path):
     content = (tmp_path / CHECKPOINT_NAME).read_bytes()
     with pytest.raises(TrainingError, match="resume=true"):
         fit(folder=tmp_path, identity=identity, **make_parts())
-    with pytest.raises(TrainingError, match=r"of another run: settings\.lr"):
-        fit(folder=tmp_path, identity=identity, resume=True, **make_parts(lr=1.0))
+    for changes, named in (({"lr": 1.0}, r"lr"), ({"updates": 5}, r"updates was 6 and is 5\.$")):
+        with pytest.raises(TrainingError, match=rf"of another run: settings\.{named}"):
+            fit(folder=tmp_path, identity=identity, resume=True, **make_parts(**changes))
     with pytest.raises(TrainingError, match=r"of another run: data\.sigma\.1 was 2\.0 and is 5\.0\.$"):
         fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": [1.0, 5.0]}}, resume=True, **make_parts())
     for option, value in (("effort", "fixed"), ("gradient", "always"), ("focal", "unknown"), ("views", 2)):
         other = PnPNet(MLPInit(6), RobustWeightedLM(2), **{option: value})
         with pytest.raises(TrainingError, match=rf"of another run: model\.{option} was .* and is {value!r}\.$"):
             fit(folder=tmp_path, identity=identity, resume=True, **{**make_parts(), "model": other})
-    with pytest.raises(TrainingError, match=r"of another run: settings\.updates was 6 and is 5\.$"):
-        fit(folder=tmp_path, identity=identity, resume=True, **make_parts(updates=5))
     assert (tmp_path / CHECKPOINT_NAME).read_bytes() == content
     report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
     assert (report.start, report.update) == (6, 6)
 
 
 def test_a_run_becomes_longer_with_the_schedule_of_the_longer_run(tmp_path):
-    """The run may have ended, and may be continued again."""
-    fit(folder=tmp_path, **make_parts())
+    """The run may have ended, and may be continued again. A signal in the last update is no interruption."""
+    report = fit(folder=tmp_path, **{**make_parts(), "loss": stopping_loss(6, signal.SIGTERM)})
+    assert (report.update, report.interrupted) == (6, False)
     report = fit(folder=tmp_path, resume=True, **{**make_parts(updates=12), "loss": stopping_loss(3, signal.SIGTERM)})
     assert (report.start, report.update, report.interrupted) == (6, 9, True)
     assert fit(folder=tmp_path, resume=True, **make_parts(updates=12)).update == 12
@@ -180,11 +179,8 @@ def test_schedules():
 
 def test_training_outside_the_main_thread(tmp_path):
     """Signals cannot be caught there. The training runs anyway."""
-    result = []
-    thread = threading.Thread(target=lambda: result.append(fit(folder=tmp_path, **make_parts())))
-    thread.start()
-    thread.join()
-    assert result[0].update == 6
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(fit, folder=tmp_path, **make_parts()).result().update == 6
 
 
 def test_train_briefly(tmp_path):
@@ -202,23 +198,15 @@ def test_train_briefly(tmp_path):
     assert float(rows[-1]["val/none/success"]) > float(rows[0]["val/none/success"])
 
 
-def make_double():
-    parts = make_parts()
-    parts["model"].double()
-    parts["data"].dtype = torch.float64
-    return {**parts, "validation": {}}
-
-
-@forks
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 def test_two_processes_equal_one(tmp_path):
     """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
-    one = make_double()
+    one = {**make_parts(dtype=torch.float64), "validation": {}}
     start = deepcopy(one["model"].state_dict())
     fit(folder=tmp_path / "one", **one)
 
     def train(fabric):
-        fit(folder=tmp_path, fabric=fabric, **make_double())
+        fit(folder=tmp_path, fabric=fabric, **{**make_parts(dtype=torch.float64), "validation": {}})
 
     Fabric(accelerator="cpu", devices=2, strategy="ddp_fork").launch(train)
     two = torch.load(tmp_path / CHECKPOINT_NAME, weights_only=True)["model"]
@@ -234,11 +222,6 @@ def test_validation_has_its_own_interval_and_does_not_change_the_training(tmp_pa
     rows = read_history(tmp_path)
     assert [row["update"] for row in rows] == ["3", "4", "6", "8", "9"]
     assert [row["update"] for row in rows if row["val/none/success"]] == ["3", "6", "9"]
-
-
-def test_a_signal_in_the_last_update_is_no_interruption(tmp_path):
-    report = fit(folder=tmp_path, **{**make_parts(), "loss": stopping_loss(6, signal.SIGTERM)})
-    assert (report.update, report.interrupted) == (6, False)
 
 
 class SlowSource(SyntheticProblems):
@@ -258,8 +241,76 @@ def test_shares_of_the_time_add_up_and_show_slow_data(tmp_path):
 
 @pytest.mark.parametrize(("batch_size", "processes"), [(15, 2), (2, 4)])
 def test_a_batch_that_cannot_be_shared_equally_is_refused_before_training(batch_size, processes, tmp_path):
-    problems = SyntheticProblems(n=6, batch_size=batch_size)
-    solver, fabric = PnPNet(MLPInit(6), RobustWeightedLM(2)), SimpleNamespace(world_size=processes)
+    parts = {**make_parts(), "data": SyntheticProblems(n=6, batch_size=batch_size)}
     with pytest.raises(BaseError, match=rf"{batch_size}.*{processes} processes"):
-        fit(solver, problems, {}, PoseLoss(), TrainSettings(3), tmp_path, fabric=fabric, progress=False)
+        fit(folder=tmp_path, fabric=SimpleNamespace(world_size=processes), **parts)
     assert list(tmp_path.iterdir()) == []
+
+
+class BrokenSource(SyntheticProblems):
+    def batch(self, index):
+        if index == 7:
+            raise ArithmeticError("batch 7 cannot be drawn")
+        return super().batch(index)
+
+
+def make_source(kind=SyntheticProblems, **options):
+    return kind(n=6, batch_size=5, seed=3, outliers=OutlierMix(), known_noise=0.5, img_sigma=(0.5, 5.0), **options)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")  # on a machine with one core
+@pytest.mark.parametrize("workers", [0, 1, 2])
+@pytest.mark.parametrize(
+    "source", [make_source(dtype=torch.float64), VaryingSize(SyntheticProblems, n=[4, 7], batch_size=6, seed=3)]
+)
+def test_batches_are_those_of_the_source_in_order(workers, source):
+    found = [same(problems, source.batch(i)) for i, problems in enumerate(stream_batches(source, 4, 25, workers), 4)]
+    assert found == [True] * 21
+    assert list(stream_batches(source, 3, 3, workers)) == []
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_of_the_source_arrives_with_its_message(workers):
+    source = make_source(BrokenSource)
+    stream = stream_batches(source, 5, 100, workers)
+    assert all(same(next(stream), source.batch(index)) for index in (5, 6))
+    with pytest.raises(ArithmeticError, match="batch 7 cannot be drawn"):
+        next(stream)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_group_does_not_end_the_workers(number):
+    source = make_source()
+    stream = stream_batches(source, 0, 30, 1)
+    assert same(next(stream), source.batch(0))
+    (worker,) = multiprocessing.active_children()
+    os.kill(worker.pid, number)
+    rest = [same(problems, source.batch(index)) for index, problems in enumerate(stream, 1)]
+    assert rest == [True] * 29
+
+
+LEFT_OPEN = """
+import multiprocessing, sys, torch
+from kornia_pnpnet.data import SyntheticProblems
+from kornia_pnpnet.data.stream import stream_batches
+
+if __name__ == "__main__":
+    multiprocessing.set_start_method(sys.argv[1])
+    source = SyntheticProblems(n=6, batch_size=5)
+    stream = stream_batches(source, 0, 10**9, workers=2)
+    for index in range(12):
+        assert torch.equal(next(stream).img_points, source.batch(index).img_points), index
+    print("end")
+"""
+
+
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_a_stream_that_is_left_open_does_not_keep_the_process(method, tmp_path):
+    """Processes that are spawned, as on systems that cannot fork, draw the same problems."""
+    script = tmp_path / "left_open.py"
+    script.write_text(LEFT_OPEN)
+    command = [sys.executable, str(script), method]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    assert (done.returncode, done.stdout) == (0, "end\n"), done.stderr

@@ -1,6 +1,5 @@
 """The patch for Kornia applies to the installed Kornia and passes its tests there; its page shows what was measured."""
 
-import importlib
 import json
 import os
 import shutil
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import kornia
 import pytest
+import upstream
 
 REPO = Path(__file__).resolve().parents[1]
 PATCHES = sorted((REPO / "docs" / "upstream").glob("*.patch"))
@@ -18,25 +18,20 @@ CHANGED = Path("kornia") / "geometry" / "calibration"
 
 # What Kornia's tests need of its repository and the wheel does not have, in our words.
 CONFTEST = """
-import functools
 import pytest
 import torch
-
 
 @pytest.fixture
 def device():
     return torch.device("cpu")
 
-
 @pytest.fixture(params=[torch.float32, torch.float64], ids=str)
 def dtype(request):
     return request.param
 
-
 @pytest.fixture
 def torch_optimizer():
-    return functools.partial(torch.compile, fullgraph=True, backend="eager")
-
+    return lambda function: torch.compile(function, fullgraph=True, backend="eager")
 
 @pytest.fixture(autouse=True)
 def names_of_doctests(doctest_namespace):
@@ -44,7 +39,6 @@ def names_of_doctests(doctest_namespace):
 """
 BASE = """
 import torch
-
 
 class BaseTester:
     def assert_close(self, actual, expected, rtol=1e-4, atol=1e-5):
@@ -55,13 +49,18 @@ class BaseTester:
 """
 
 
+def run(folder, *command, **environment):
+    """What a command prints that must succeed."""
+    options = {"cwd": folder, "env": {**os.environ, **environment}, "capture_output": True, "text": True}
+    done = subprocess.run(command, check=False, **options)
+    assert done.returncode == 0, (done.stderr + done.stdout)[-4000:]
+    return done.stdout
+
+
 def apply(folder):
     """Apply the patches in ``folder``; the wheel has no documentation."""
     # Inside a repository git would look for the paths from its top.
-    environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(folder.parent)}
-    command = ["git", "apply", "--exclude=docs/*", *map(str, PATCHES)]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run(folder, "git", "apply", "--exclude=docs/*", *map(str, PATCHES), GIT_CEILING_DIRECTORIES=str(folder.parent))
 
 
 def test_patch_applies_to_the_installed_kornia(tmp_path):
@@ -79,20 +78,12 @@ def test_tests_of_the_patch_pass_in_the_patched_kornia(tmp_path):
     (tmp_path / "testing").mkdir()
     (tmp_path / "testing" / "base.py").write_text(BASE)
     command = [sys.executable, "-m", "pytest", "-q", "--doctest-modules", "tests", str(CHANGED / "pnp_robust.py")]
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-4000:]
-    assert "skipped" not in done.stdout
-
-
-@pytest.fixture
-def upstream():
-    pytest.importorskip("cv2")
-    return importlib.import_module("upstream")
+    assert "skipped" not in run(tmp_path, *command, PYTHONPATH=str(tmp_path))
 
 
 @pytest.mark.slow
-def test_patch_is_measured_beside_the_others(upstream):
+def test_patch_is_measured_beside_the_others():
+    pytest.importorskip("cv2")
     rows = {row["solver"]: row for row in upstream.measure_success(20, ((12, 0.25),))}
     assert rows["solve_pnp_robust"]["success"] > 0.9
     assert rows["solve_pnp_dlt"]["success"] < 0.5
@@ -100,6 +91,6 @@ def test_patch_is_measured_beside_the_others(upstream):
     assert all(row["last"] < row["first"] for row in upstream.measure_descent(4, (0.0,)))
 
 
-def test_tables_of_the_page_are_written_from_the_file(upstream):
+def test_tables_of_the_page_are_written_from_the_file():
     results = json.loads((REPO / "benchmarks" / "upstream.json").read_text())
     assert upstream.page(results) in (REPO / "docs" / "upstream.md").read_text(encoding="utf-8")

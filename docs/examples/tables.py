@@ -26,8 +26,7 @@ def page(name: str) -> str:
         made = foot(results["environment"])
         return f"{match[1]}\n\n{getattr(tables, match[2])(results)}\nMeasured: {made}.\n<!-- end -->"
 
-    text = (HERE / name).read_text()
-    return re.sub(r"(<!-- (\w+)\.json, by tables\.py -->).*?<!-- end -->", table, text, flags=re.S)
+    return re.sub(r"(<!-- (\w+)\.json, by tables\.py -->).*?<!-- end -->", table, (HERE / name).read_text(), flags=re.S)
 
 
 if __name__ == "__main__":

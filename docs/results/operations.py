@@ -78,11 +78,10 @@ _ELEMENTWISE = {
     name: cost
     for names, cost in (
         ("_local_scalar_dense _to_copy _unsafe_view alias arange cat clone constant_pad_nd copy detach diag_embed", 0),
-        ("diagonal empty empty_like expand eye fill flip full full_like gather index index_copy index_put", 0),
+        ("diagonal empty empty_like expand eye fill flatten flip full full_like gather index index_copy index_put", 0),
         ("index_select lift_fresh masked_select neg new_empty new_full new_ones new_zeros nonzero ones ones_like", 0),
-        ("permute promote_types rand randperm repeat scalar_tensor scatter select slice split split_with_sizes", 0),
-        ("flatten roll select_scatter squeeze stack t take_pairs transpose unbind unsqueeze view", 0),
-        ("zero zeros zeros_like", 0),
+        ("permute promote_types rand randperm repeat roll scalar_tensor scatter select select_scatter slice split", 0),
+        ("split_with_sizes squeeze stack t take_pairs transpose unbind unsqueeze view zero zeros zeros_like", 0),
         ("add rsub scatter_add sub", ADD),
         ("mul square", MULTIPLY),
         ("div floor_divide reciprocal remainder", DIVIDE),
