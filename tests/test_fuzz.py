@@ -514,14 +514,17 @@ def test_the_first_calls_of_each_function_keep_the_laws(name):
 
 def text(call: Call) -> str:
     """The call with the forms of its tensors."""
-    form = lambda x: f"{x.dtype} {[*x.shape]} {x.stride()}" + " with gradient" * x.requires_grad  # noqa: E731
+
+    def form(x: Tensor) -> str:
+        return f"{x.dtype} {[*x.shape]} {x.stride()}" + " with gradient" * x.requires_grad
+
     return str(call._replace(args=mapped(form, call.args)))
 
 
-def main(minutes: float = 60.0, *seeds: int) -> None:
+def main(minutes: int = 60, *seeds: int) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    end, outcomes = time.time() + 60.0 * minutes, Counter()
+    end, outcomes = time.time() + 60 * minutes, Counter()
     for seed in seeds or takewhile(lambda _: time.time() < end, count(int(time.time()) * 1000)):
         try:
             check(draw(seed), seed)
