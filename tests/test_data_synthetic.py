@@ -486,3 +486,10 @@ def test_in_a_mixture_unknown_sigmas_are_nan_and_sigmas_of_pairs_go_with_those_o
     constant = (p.img_sigma == 1.0).all(1)
     assert (constant.sum(), p.img_sigma.isnan().all(1).sum()) == (10, 10)
     assert torch.equal(constant, (p.world_sigma == p.world_sigma[constant][0, 0]).all(1))
+
+
+def test_varying_sizes_are_reproducible_and_come_from_the_list():
+    mixture = partial(data.MixedProblems, [SyntheticProblems], known_noise=0.5)
+    one, two = (data.VaryingSize(mixture, n=[5, 9, 20], batch_size=40, seed=3) for _ in range(2))
+    assert all(same(one.batch(i), two.batch(i)) for i in range(30))
+    assert {tuple(one.batch(i).inliers.shape) for i in range(30)} == {(40, 5), (22, 9), (10, 20)}

@@ -7,7 +7,7 @@ from strategies import finite
 
 from kornia_pnpnet import Pose, create_solver, pose_errors, success
 from kornia_pnpnet.core import linalg
-from kornia_pnpnet.core.linalg import nearest_rotation, solve_positive
+from kornia_pnpnet.core.linalg import align, nearest_rotation, solve_leading, solve_positive
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, are_semi_definite, equivalent_sigma
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.refine.residual import rotation_angle
@@ -195,6 +195,32 @@ def test_gradcheck_of_the_nearest_rotation(generator):
         inputs = (x.clone().requires_grad_(),)
         assert torch.autograd.gradcheck(lambda m: nearest_rotation(m)[0], inputs, check_forward_ad=True)
         assert torch.autograd.gradgradcheck(lambda m: nearest_rotation(m)[0], inputs)
+
+
+def test_align_finds_a_similarity(random_rotations, generator):
+    """With weights of 0 for outliers; without noise it is exact."""
+    source = torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
+    rotation, shift = random_rotations(7), torch.randn(7, 1, 3, generator=generator, dtype=torch.float64)
+    target = 2.5 * source @ rotation.mT + shift
+    target[:, 0] += 100.0
+    weights = torch.rand(7, 9, generator=generator, dtype=torch.float64)
+    weights[:, 0] = 0.0
+    found, translation, scale = align(source, target, weights)
+    torch.testing.assert_close(found, rotation)
+    torch.testing.assert_close(scale, torch.full((7,), 2.5, dtype=torch.float64))
+    share = (weights / weights.sum(1, keepdim=True))[..., None]
+    means = [(share * x).sum(1) for x in (source, target)]
+    torch.testing.assert_close(translation, means[1] - (rotation @ means[0][..., None])[..., 0])
+
+
+def test_a_singular_system_in_its_range_has_a_finite_solution():
+    matrix = torch.zeros(3, 3, 1, dtype=torch.float64)
+    matrix[:2, :2] = 1.0
+    rhs = torch.tensor([2.0, 2.0, 0.0], dtype=torch.float64)[:, None]
+    (solution,) = solve_leading(matrix, rhs, (3,))
+    reached = (matrix[..., 0] @ torch.stack(solution)[:, 0])[:, None]
+    torch.testing.assert_close(reached, rhs)
+    assert torch.stack(solution).isfinite().all()
 
 
 @pytest.mark.usefixtures("few")
