@@ -72,28 +72,6 @@ def perturb() -> Callable[..., Pose]:
 
 
 @pytest.fixture
-def fit_config(tmp_path: Path) -> Callable[..., Any]:
-    """Train what a composed configuration describes, as ``train.py`` does, or another solver in its place."""
-    from hydra.utils import instantiate
-
-    from kornia_pnpnet.training import fit
-
-    def run(config: Any, solver: torch.nn.Module | None = None) -> Any:
-        return fit(
-            instantiate(config.model.solver) if solver is None else solver,
-            instantiate(config.data.train),
-            {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
-            instantiate(config.loss),
-            instantiate(config.train, _convert_="all"),
-            tmp_path,
-            fabric=instantiate(config.engine),
-            progress=False,
-        )
-
-    return run
-
-
-@pytest.fixture
 def drawn(monkeypatch):
     """Figures by file name, laid out as they would have been saved."""
     figure = pytest.importorskip("matplotlib.figure")

@@ -1,18 +1,41 @@
-"""Helpers that several tests share: comparisons, the share of problems that are solved, and derivatives."""
+"""Helpers that several tests share: comparisons, derivatives, statistics, toy scenes, and what fuzz tests draw."""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
+import math
+import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+import pytest
 import torch
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from kornia.core.exceptions import BaseError
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import Pose, Problems, pose_errors, success
+from kornia_pnpnet.cli import main
+from kornia_pnpnet.core.trees import iter_tensors
+from kornia_pnpnet.data import Scene, SyntheticProblems, View
 from kornia_pnpnet.problem import State
+from kornia_pnpnet.refine.kernels import KERNELS
+from kornia_pnpnet.refine.lm import BACKWARDS
 from kornia_pnpnet.refine.residual import moved
+
+COUNT = 20_000
+# 99.9 % points of the chi-square distribution by degrees of freedom. The seeds are fixed, so that results do not vary.
+CHI_SQUARE = {1: 10.83, 2: 13.82, 3: 16.27, 6: 22.46, 8: 26.12, 19: 43.82}
+
+WIDTH, HEIGHT, FOCAL, CENTRE = 640, 480, 500.0, np.array([320.0, 240.0])
+ERRORS = BaseError, ValueError
+NAN, INF = float("nan"), float("inf")
+TIMES = int(os.environ.get("PNPNET_EXAMPLES", "1"))
 
 
 def assert_same(one: Any, two: Any, rtol: float = 0.0, atol: float = 0.0) -> None:
@@ -21,7 +44,7 @@ def assert_same(one: Any, two: Any, rtol: float = 0.0, atol: float = 0.0) -> Non
         torch.testing.assert_close(a, b, rtol=rtol, atol=atol)
 
 
-@contextmanager
+@contextlib.contextmanager
 def other_defaults(dtype: torch.dtype, device: str = "meta") -> Iterator[None]:
     """Give PyTorch a default dtype and a default device. Tensors of ``meta`` hold no numbers."""
     torch.set_default_dtype(dtype)
@@ -69,3 +92,193 @@ def verify_jacobian(function: Callable[[State], Tensor], state: State, analytic:
     expected = verified_derivative(function, state)
     longest = expected.abs().amax((0, 1)).clamp(min=1e-3)
     assert ((analytic - expected) / longest).abs().max() < 1e-9
+
+
+def assert_distances(sample, distribution):
+    """The Kolmogorov-Smirnov distance at the 0.1 % level."""
+    sample = sample.flatten().double().sort().values
+    share = torch.arange(1, len(sample) + 1, dtype=torch.float64) / len(sample)
+    assert (distribution(sample) - share).abs().max() < 1.95 / math.sqrt(len(sample))
+
+
+def assert_uniform(sample, low, high):
+    assert sample.min() >= low
+    assert sample.max() <= high
+    assert_distances(sample, lambda x: (x - low) / (high - low))
+
+
+def assert_normal(sample, sigma):
+    assert_distances(sample, lambda x: 0.5 * (1 + torch.erf(x / (sigma * math.sqrt(2)))))
+
+
+def assert_counts(counts, shares=None):
+    """Chi-square at the 0.1 % level."""
+    counts = counts.double()
+    expected = counts.sum() * (torch.ones(len(counts)) / len(counts) if shares is None else torch.tensor(shares))
+    assert ((counts - expected).square() / expected).sum() < CHI_SQUARE[len(counts) - 1]
+
+
+def draw(n=9, batch=COUNT, **options):
+    return SyntheticProblems(n=n, batch_size=batch, seed=7, dtype=torch.float64, **options).batch(0)
+
+
+def same(one, two):
+    """Whether two trees hold the same numbers, NaN included."""
+    pairs = zip(iter_tensors(one), iter_tensors(two), strict=True)
+    return all(a.dtype == b.dtype and torch.allclose(a, b, rtol=0, atol=0, equal_nan=True) for a, b in pairs)
+
+
+def arrays(problems):
+    """The arrays of a shard."""
+    return {name: getattr(problems, name).numpy() for name in ("world_points", "img_points", "intrinsics")}
+
+
+def table(problems, **more):
+    """The table of a shard, with more columns."""
+    from kornia_pnpnet.arrow import list_column
+
+    columns = {name: list_column(np.asarray(array)) for name, array in (arrays(problems) | more).items()}
+    return pytest.importorskip("pyarrow").table(columns)
+
+
+def pose_of(i):
+    """Quaternion (w, x, y, z), rotation matrix and translation of image i, from first principles."""
+    angle = 0.1 + 0.2 * i
+    axis = np.array([1.0, 2.0, -1.0]) / math.sqrt(6)
+    cross = np.cross(np.eye(3), axis)
+    rotation = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    quaternion = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis)])
+    return quaternion, rotation, np.array([0.3 * i, -0.2, 0.5])
+
+
+def make_view(name="a.jpg", count=30, seed=0):
+    """A view whose observations are exact. All its pixels differ."""
+    rng = np.random.default_rng(seed)
+    _, rotation, translation = pose_of(seed)
+    plane = rng.uniform(-0.5, 0.5, (count, 2))
+    cam = np.hstack([plane, np.ones((count, 1))]) * rng.uniform(2, 8, (count, 1))
+    return View(
+        name=name,
+        world_points=torch.tensor((cam - translation) @ rotation),
+        img_points=torch.tensor(FOCAL * plane + CENTRE),
+        intrinsics=torch.tensor([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]], dtype=torch.float64),
+        rotation=torch.tensor(rotation),
+        translation=torch.tensor(translation),
+        width=WIDTH,
+        height=HEIGHT,
+        inliers=torch.ones(count, dtype=torch.bool),
+    )
+
+
+def make_scene(*counts):
+    return Scene("toy", tuple(make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)), ())
+
+
+def match_arrays(*counts):
+    """The arrays of a file of matches; every fifth match is off by 30 px."""
+    views = [make_view(f"{i}.jpg", count, seed=i) for i, count in enumerate(counts)]
+    fields = {"K": "intrinsics", "R": "rotation", "t": "translation"}
+    arrays = {key: np.stack([getattr(view, name).numpy() for view in views]) for key, name in fields.items()}
+    arrays |= {"names": np.array([view.name for view in views]), "size": np.array([[WIDTH, HEIGHT]] * len(views))}
+    for i, view in enumerate(views):
+        error = np.where(np.arange(len(view.img_points)) % 5 == 0, 30.0, 0.0)
+        arrays[f"{i:03d}_img_points"] = view.img_points.numpy() + error[:, None] * [1.0, 0.0]
+        arrays[f"{i:03d}_world_points"] = view.world_points.numpy()
+        arrays[f"{i:03d}_error_px"] = error.astype(np.float32)
+    return arrays
+
+
+def many(examples):
+    """Settings of a fuzz test; ``PNPNET_EXAMPLES`` multiplies its examples."""
+    slow = [HealthCheck.too_slow]
+    count = max(1, examples // 2 * TIMES)
+    return settings(max_examples=count, deadline=None, derandomize=True, suppress_health_check=slow)
+
+
+def finite(*values):
+    for value in values:
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == torch.bool or value.isfinite().all()
+        elif value is not None:
+            finite(*value)
+
+
+def are_rotations(matrices):
+    finite(matrices)
+    flat = matrices.detach().double().reshape(-1, 3, 3)
+    torch.testing.assert_close(flat @ flat.mT, torch.eye(3).double().expand_as(flat), rtol=0, atol=1e-4)
+
+
+#: Numbers for options: sound ones, and those that make no sense.
+ANY = st.one_of(st.floats(-2.0, 200.0), st.sampled_from([0, 1, -1, 0.0, 1e-6, 1e6, INF, -INF, NAN]))
+COUNTS = st.one_of(st.integers(-2, 12), st.sampled_from([0.5, NAN, True]))
+# Without a slash, which would make a word the name of a repository on the Hub.
+TEXT = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), max_size=12)
+OPTIONS = ["fixed", "adaptive", "unknown", "always"]
+OPTIONS += [*KERNELS, *BACKWARDS, "additive", "msac", "AP3P", "EPNP", "USAC_FAST", "epnp-lm", "pnpnet-n9"]
+WORD = TEXT | st.sampled_from(OPTIONS)
+ARGUMENTS = ["800,800,320,240", "epnp", "p3p-ransac:threshold=2", "pnpnet-set:m=", "epnp:1", "nan", "-1", "--x"]
+WORDS = TEXT | st.sampled_from(ARGUMENTS)
+
+#: What damage puts into a file.
+TOKENS = (*b',|\n|\r|"|\0|\xff|nan|inf|-|1e999|;| |PK\x03\x04'.split(b"|"), b"9" * 400)
+
+
+@st.composite
+def damage(draw, content):
+    """A file of which something was lost, changed or put in, up to four times."""
+    content = bytearray(content)
+    for _ in range(draw(st.integers(1, 4))):
+        place = draw(st.integers(0, len(content)))
+        match draw(st.sampled_from(["cut", "lose", "change", "put in"])):
+            case "cut":
+                del content[place:]
+            case "lose":
+                del content[place : place + draw(st.integers(1, 40))]
+            case "change":
+                content[place : place + 1] = draw(st.binary(min_size=1, max_size=1))
+            case "put in":
+                content[place:place] = draw(st.sampled_from(TOKENS))
+    return bytes(content)
+
+
+def names_the_file(error, path):
+    assert str(path) in str(error)
+
+
+@st.composite
+def spoiled(draw, content, places):
+    """Results of which some values were lost or replaced."""
+    content = json.loads(json.dumps(content))
+    for _ in range(draw(st.integers(1, 3))):
+        *path, last = draw(st.sampled_from(places))
+        inner = content
+        with contextlib.suppress(KeyError, IndexError, TypeError):
+            for key in path:
+                inner = inner[key]
+            if draw(st.booleans()):
+                del inner[last]
+            else:
+                inner[last] = draw(st.sampled_from([None, "", "x", -1, 0, 1e300, [], {}, [None], True, {"a": 1}]))
+    return content
+
+
+def places_in(content, path=()):
+    """All keys and indices of nested lists and dictionaries; of long lists the first two."""
+    if isinstance(content, list):
+        content = dict(enumerate(content[:2]))
+    for key, value in content.items() if isinstance(content, dict) else ():
+        yield (*path, key)
+        yield from places_in(value, (*path, key))
+
+
+def run_main(*arguments):
+    """Exit code and what was printed. With the exit code 2 that is one line and no traceback."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main([str(x) for x in arguments])
+        except SystemExit as end:
+            code = end.code
+    assert code != 2 or (err.getvalue()[:8], err.getvalue().count("\n")) == ("pnpnet: ", 1), err.getvalue()
+    return code, out.getvalue(), err.getvalue()

@@ -8,10 +8,9 @@ import sys
 import numpy as np
 import pytest
 import torch
-from data_helpers import arrays
-from data_helpers import table as table_of
+from helpers import arrays, run_main
+from helpers import table as table_of
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
-from strategies import run_main
 
 from kornia_pnpnet import create_solver
 from kornia_pnpnet.cli.correspondence_files import InputError

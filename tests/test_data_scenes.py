@@ -6,17 +6,30 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import data_helpers
 import numpy as np
 import pytest
 import torch
-from data_helpers import CENTRE, FOCAL, HEIGHT, WIDTH, assert_uniform, make_scene, make_view, match_arrays, pose_of
-from helpers import reprojection_errors
+from helpers import (
+    CENTRE,
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    assert_counts,
+    assert_uniform,
+    damage,
+    finite,
+    make_scene,
+    make_view,
+    many,
+    match_arrays,
+    names_the_file,
+    pose_of,
+    reprojection_errors,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from strategies import damage, finite, many, names_the_file
 from torch.testing import assert_close
 
 from kornia_pnpnet.data import OutlierMix, Scene, SceneProblems, load_scene
@@ -142,7 +155,7 @@ def test_models_that_cannot_be_used(tmp_path, pycolmap, changes, message):
         (tmp_path / file).write_text(content)
     with pytest.raises(ValueError, match=message) as caught:
         load_scene(tmp_path)
-    names_the_file(caught.value, tmp_path)
+    assert str(tmp_path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -346,7 +359,7 @@ def test_images_are_equally_likely_and_small_ones_unused():
     scene = make_scene(10, 500, 9)
     source = SceneProblems(scene, batch_size=4000)
     assert [view.name for view in source.views] == ["0.jpg", "1.jpg"]
-    data_helpers.assert_counts((pairs_of(scene, source.batch(0).img_points[:, 0]) >= 10).long().bincount())
+    assert_counts((pairs_of(scene, source.batch(0).img_points[:, 0]) >= 10).long().bincount())
 
 
 def test_points_of_an_image_are_a_uniform_ordered_choice_without_repetition():

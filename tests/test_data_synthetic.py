@@ -6,8 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from data_helpers import COUNT, assert_counts, assert_normal, assert_uniform, draw, make_scene, same
-from helpers import reprojection_errors
+from helpers import COUNT, assert_counts, assert_normal, assert_uniform, draw, make_scene, reprojection_errors, same
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 

@@ -4,13 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from data_helpers import make_view, same
-from helpers import assert_same, rate, reprojection_errors
+from helpers import assert_same, finite, make_view, rate, reprojection_errors, same
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from laws import BAD, Case, make_bad, take
-from strategies import finite
 
 from kornia_pnpnet import PnPNet, list_solvers
 from kornia_pnpnet.cli.arguments import SYNTHETIC

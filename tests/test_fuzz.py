@@ -18,10 +18,9 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from helpers import other_defaults
+from helpers import are_rotations, finite, other_defaults
 from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
-from strategies import are_rotations, finite
 from torch import Tensor
 from torch.nn.functional import pad
 from torch.utils import _pytree as pytree

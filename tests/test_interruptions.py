@@ -11,12 +11,10 @@ import time
 import numpy as np
 import pytest
 import torch
-from data_helpers import arrays, table
-from helpers import assert_same
+from helpers import arrays, assert_same, damage, many, table
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import ValueCheckError
-from strategies import damage, many
 from test_training_loop import LossWith, comparable, forks, make_parts, read_history
 
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM

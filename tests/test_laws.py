@@ -4,12 +4,10 @@ from itertools import product
 
 import pytest
 import torch
-from data_helpers import make_scene, same
-from helpers import assert_same, other_defaults
+from helpers import assert_same, make_scene, many, other_defaults, same
 from hypothesis import given
 from hypothesis import strategies as st
 from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gradcheck
-from strategies import many
 
 from kornia_pnpnet import create_solver, data
 from kornia_pnpnet.core.trees import map_tensors

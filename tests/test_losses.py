@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import ERRORS, finite
 from laws import PAIRS, Case, make, make_bad
-from strategies import ERRORS, finite
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import Noise, PnPResult, Pose, PoseLoss, SetLoss, Starts, create_solver, pose_covariance

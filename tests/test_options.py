@@ -6,11 +6,10 @@ from functools import partial
 
 import pytest
 import torch
-from data_helpers import make_scene
+from helpers import ANY, COUNTS, ERRORS, WORD, are_rotations, finite, make_scene, many
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
-from strategies import ANY, COUNTS, ERRORS, WORD, are_rotations, finite, many
 
 import kornia_pnpnet as k
 from kornia_pnpnet import MLPInit, Normalize, PnPNet, PoseLoss, RobustWeightedLM, SetInit, SetLoss, create_solver, data

@@ -9,10 +9,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import rate
+from helpers import many, names_the_file, places_in, rate, spoiled
 from hypothesis import given
 from kornia.core.exceptions import ValueCheckError
-from strategies import many, names_the_file, places_in, spoiled
 
 from kornia_pnpnet import PnPNet, create_solver, shipped_weights
 from kornia_pnpnet.core.files import digest, write_json

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from helpers import rate
-from strategies import finite
+from helpers import finite, rate
 
 from kornia_pnpnet import Pose, create_solver, pose_errors, success
 from kornia_pnpnet.core import linalg

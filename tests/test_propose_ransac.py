@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from strategies import are_rotations, finite
+from helpers import are_rotations, finite
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_errors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_helpers import table
+from helpers import table
 
 from kornia_pnpnet.data import SyntheticProblems
 

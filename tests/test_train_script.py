@@ -20,6 +20,7 @@ from omegaconf import OmegaConf
 
 from kornia_pnpnet import PnPNet
 from kornia_pnpnet.core.files import read_csv
+from kornia_pnpnet.training import fit
 from kornia_pnpnet.training.checkpoint import History
 from kornia_pnpnet.training.results import load_run
 
@@ -254,19 +255,33 @@ CASES += [
 ]
 
 
+def fit_config(config, folder, solver=None):
+    """Train what a composed configuration describes, as ``train.py`` does, or another solver in its place."""
+    return fit(
+        instantiate(config.model.solver) if solver is None else solver,
+        instantiate(config.data.train),
+        {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
+        instantiate(config.loss),
+        instantiate(config.train, _convert_="all"),
+        folder,
+        fabric=instantiate(config.engine),
+        progress=False,
+    )
+
+
 @pytest.mark.parametrize(("experiment", "overrides"), CASES)
-def test_every_experiment_trains(experiment, overrides, fit_config):
-    report = fit_config(composed(f"experiment={experiment}", *overrides, *THREE))
+def test_every_experiment_trains(experiment, overrides, tmp_path):
+    report = fit_config(composed(f"experiment={experiment}", *overrides, *THREE), tmp_path)
     assert (report.update, report.skipped) == (3, 0)
 
 
 @pytest.mark.parametrize(("experiment", "part"), [("net_loss_only", "init"), ("identity_start", "refine")])
-def test_what_an_ablation_trains(experiment, part, fit_config):
+def test_what_an_ablation_trains(experiment, part, tmp_path):
     """The network alone, or the refiner alone, from the first update on."""
     config = composed(f"experiment={experiment}", *THREE)
     solver = instantiate(config.model.solver)
     before = deepcopy(solver.state_dict())
-    fit_config(config, solver)
+    fit_config(config, tmp_path, solver)
     moved = {name for name, value in solver.state_dict().items() if not torch.equal(value, before[name])}
     assert moved == {name for name, _ in solver.named_parameters() if name.startswith(f"{part}.")}
     settings = instantiate(config.train, _convert_="all")

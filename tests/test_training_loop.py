@@ -13,8 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from data_helpers import same
-from helpers import assert_same
+from helpers import assert_same, same
 from kornia.core.exceptions import BaseError
 from lightning_fabric import Fabric
 
