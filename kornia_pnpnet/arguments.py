@@ -30,7 +30,7 @@ __all__ = ["checked_inputs", "given_cameras", "in_parts", "restore_leading"]
 
 _T = TypeVar("_T")
 
-# When `in_parts` removes padding, each problem keeps at least this number of rows, which can include padding.
+# Least number of rows, padding included, that a problem keeps when `in_parts` removes padding.
 _LEAST_PAIRS = 16
 
 
@@ -143,7 +143,7 @@ def _checked_noise(
     img_cov: Tensor | None,
     world_cov: Tensor | None,
 ) -> Noise | None:
-    """The noise of every pair in the dtype of ``world_points``; ``None`` if the caller gave no noise."""
+    """Return the noise of every pair in the dtype of ``world_points``, or ``None`` if the caller gave no noise."""
     kinds: dict[str, tuple[Any, Any, Any]] = {
         "img": (img_sigma, img_cov, Symmetric2),
         "world": (world_sigma, world_cov, Symmetric3),
@@ -166,7 +166,7 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, like: Tensor) -> Tensor:
-    """Return the caller's camera matrices of a rig, for each problem or each pair, scaled to a last entry of 1."""
+    """Return a rig's camera matrices, one for each problem or each pair, scaled so that the last entry is 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = _cameras(intrinsics, size).to(like.dtype)
@@ -182,11 +182,11 @@ def _cameras(intrinsics: Tensor | PinholeCamera, size: torch.Size) -> Tensor:
 
 
 def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | None, any_number: bool) -> PnPResult:
-    """Solve a batch. On a CPU, parts of the batch that fit the caches are solved one after the other.
+    """Solve a batch. On a CPU, split the batch into parts that fit the caches, and solve one part after the other.
 
-    A part has at most ``most`` pairs for each CPU thread. The size of a part has no limit if ``most`` is ``None`` or
-    gradients are recorded. If ``any_number`` is true, ``solve`` accepts any number of pairs. Problems are then grouped
-    by number of pairs, to reduce padding. Grouping saves a third to half of the time if these numbers differ strongly.
+    A part has about ``most`` pairs for each CPU thread. The size of a part has no limit if ``most`` is ``None`` or
+    gradients are recorded. If ``any_number`` is true, ``solve`` accepts any number of pairs. Problems with a mask are
+    then grouped by their number of pairs. If these numbers differ strongly, grouping saves a third to half of the time.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:

@@ -72,7 +72,7 @@ class Solve:
         ([7, 8], [True, True])
     """
 
-    #: A call of the solver gets at most about this number of pairs, padding included, to limit the memory.
+    #: Approximate largest number of pairs, padding included, in one call of the solver. The limit saves memory.
     pairs_at_once = 2**17
 
     def __init__(
@@ -85,7 +85,7 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve a table. Raise ``ValueCheckError`` for a missing column, ``TypeCheckError`` for one without numbers."""
+        """Solve a table. Missing columns raise ``ValueCheckError``, and columns without numbers ``TypeCheckError``."""
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"the table has no column {name}")
@@ -159,7 +159,7 @@ class _Cells:
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
     """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
 
-    Problems with at least 16 pairs are padded, by at most a quarter, to the next of 16, 20, 24, 28, 32, 40, 48, ...
+    Problems of 16 or more pairs are padded by less than a quarter, to the next size in 16, 20, 24, 28, 32, 40, 48, ...
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
     widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)

@@ -1,7 +1,7 @@
 """Undistort pixels, convert pixels to bearings, make cameras that look along bearings, and project points.
 
 The *undistorted point* of a pixel lies on the pixel's ray and on the plane z = 1. Rays of a fisheye can miss the plane.
-For a fisheye, the undistorted point is the unit vector along the ray's (x, y), times the angle to the optical axis.
+For a fisheye, the point is therefore the unit vector along the ray's (x, y), times the angle from the optical axis.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _WIDEST = 1.4835
 def undistort(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None, fisheye: Tensor | None, noise: Noise | None
 ) -> tuple[Tensor, Tensor, Noise | None]:
-    r"""Replace pixels of a camera with distortion by pixels of the pinhole camera with the same intrinsics.
+    r"""Replace distorted pixels by pixels of the pinhole camera that has the same intrinsics.
 
     Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse. Unlike
     this function, :func:`kornia.geometry.calibration.undistort_points` does not reject pixels without a solution.
@@ -65,7 +65,7 @@ def undistort(
         noise: noise of the distorted pixels.
 
     Returns:
-        The undistorted pixels; which pixels have a solution, bool :math:`(B, N)`; and the noise of the undistorted
+        The undistorted pixels; whether each pixel has a solution, bool :math:`(B, N)`; and the noise of the undistorted
         pixels. A pixel has no solution if it is outside the range of the polynomial, if it is more than 85 degrees off
         the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point replaces such a
         pixel. Each sigma is multiplied by the root mean square singular value of the undistortion's Jacobian.
@@ -85,7 +85,7 @@ def undistort(
             jacobian = torch.where(found[..., None, None], jacobian, eye)
         to_pixels = camera[:, None, :2, :2]
         jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
-        # Noise that is not finite (an unknown sigma is NaN) does not change, and adds no gradient to the camera.
+        # Noise that is not finite (an unknown sigma is NaN) stays unchanged, and gives the camera no gradient.
         factor, finite = (0.5 * jacobian.square().sum((-1, -2))).sqrt(), noise.img.isfinite()
         noise = noise._replace(img=torch.where(finite, torch.where(finite, noise.img, 0.0) * factor, noise.img))
         if noise.img_cov is not None:
@@ -115,9 +115,9 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
 def bearings(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None = None, fisheye: Tensor | None = None
 ) -> Tensor:
-    r"""Convert pixels to bearings, the directions of their rays in the camera's frame.
+    r"""Convert pixels to bearings.
 
-    Bearings of a fisheye may be more than 90 degrees off the optical axis.
+    A bearing is the direction of a pixel's ray. Bearings of a fisheye may be more than 90 degrees off the optical axis.
 
     Args:
         img_points: shape :math:`(B, N, 2)`. :math:`B` stands for any number of leading dimensions, including none.
@@ -130,7 +130,7 @@ def bearings(
         bearing of a pixel that cannot be undistorted is NaN and has no gradient.
 
     Raises:
-        ShapeError: for other shapes, and for a number of coefficients that no lens model has.
+        ShapeError: when a shape is not as above, or when no lens model has the given number of coefficients.
         ValueCheckError: when both ``dist`` and ``fisheye`` are given.
         BaseError: for tensors on different devices, and for booleans or complex numbers.
 
@@ -163,7 +163,7 @@ def bearings(
 
 
 def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
-    """Raise an error when both arguments are given, or when no lens model has as many coefficients as given."""
+    """Raise an error when both arguments are given, or when no lens model has the given number of coefficients."""
     check_tensors({"dist": dist, "fisheye": fisheye})
     if dist is not None and fisheye is not None:
         raise ValueCheckError("Give dist or fisheye, not both.")
@@ -174,7 +174,7 @@ def check_coefficients(dist: Tensor | None, fisheye: Tensor | None) -> None:
 
 
 def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Rotations (B, N, 3, 3) that map directions (B, N, 3) to the z axis, and which directions are valid, bool (B, N).
+    r"""Find rotations (B, N, 3, 3) that map directions (B, N, 3) to the z axis, and mark valid directions, bool (B, N).
 
     A direction is invalid if it is not finite, or if no entry exceeds the square root of the smallest normal number. An
     invalid direction gets a constant rotation.
@@ -186,7 +186,7 @@ def bearing_cameras(rays: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_form(["*", "3"], rays=rays)
     rays = rays.to(common_dtype({"rays": rays}))
-    largest = rays.detach().abs().amax(-1, keepdim=True)  # the squares of rays divided by this number are finite
+    largest = rays.detach().abs().amax(-1, keepdim=True)  # rays divided by this number have finite squares
     # If all entries of a direction were below this limit, the gradient of the direction would overflow.
     sound = (largest > torch.finfo(rays.dtype).tiny ** 0.5) & largest.isfinite()
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=rays.dtype, device=rays.device)
@@ -204,7 +204,7 @@ def looking_along(inputs: Inputs) -> Inputs:
     inputs = map_tensors(torch.Tensor.contiguous, inputs)  # see `with_undistorted`
     rotation, sound = bearing_cameras(inputs.img_points)
     rig = inputs.rig
-    if rig is not None:  # a pair with an invalid camera becomes a pair without a direction
+    if rig is not None:  # an invalid camera makes the direction of its pair invalid
         sound = sound & torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach().isfinite().all(-1)
         turn, shift = sound_pose(rig, sound)
         rig = Pose(rotation @ turn, (rotation @ shift[..., None])[..., 0])
@@ -224,12 +224,12 @@ def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def focal_length(camera: Tensor) -> Tensor:
-    """Geometric mean of the absolute values of fx and fy of valid camera matrices (*, 3, 3), shape (*)."""
+    """Return the geometric mean of the absolute fx and fy for valid camera matrices (*, 3, 3), shape (*)."""
     return (camera[..., 0, 0] * camera[..., 1, 1]).abs().sqrt()
 
 
 def reproject(world_points: Tensor, intrinsics: Tensor, pose: Pose) -> Tensor:
-    """Pixels (B, N, 2) of world points (B, N, 3); NaN for points that are not in front of the camera."""
+    """Project world points (B, N, 3) to pixels (B, N, 2). Points that are not in front of the camera become NaN."""
     cam_points = world_points @ pose.rotation.mT + pose.translation[:, None]
     in_front = cam_points[..., 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
@@ -239,7 +239,7 @@ def reproject(world_points: Tensor, intrinsics: Tensor, pose: Pose) -> Tensor:
 def _through(
     dist: Tensor | None, fisheye: Tensor | None, img_points: Tensor, intrinsics: Tensor
 ) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-    """Undistorted points (B, N, 2), whether each pixel has an undistorted point, bool (B, N), and the :func:`_lens`."""
+    """Return undistorted points (B, N, 2), whether each pixel has such a point, bool (B, N), and the lens function."""
     camera, sound = pinholes(intrinsics)
     coefficients = fisheye if dist is None else dist
     if coefficients is not None:
@@ -269,7 +269,7 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
 
 
 def _angle(point: Tensor) -> Tensor:
-    """Angles (B, N, 1) of a fisheye's undistorted points, bounded below, so that derivatives at 0 are finite."""
+    """Return the angles (B, N, 1) of a fisheye's undistorted points. A lower bound keeps derivatives at 0 finite."""
     return point.square().sum(-1, keepdim=True).clamp(min=torch.finfo(point.dtype).eps ** 2).sqrt()
 
 
@@ -280,9 +280,9 @@ def _flatten(point: Tensor) -> Tensor:
 
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Find points (B, N, 2) that a lens maps to ``target``, else 0, and tell which targets have such a point."""
-    # A Newton step is at most half the distance of the target from the centre. Two steps after the loop give the points
-    # gradients of the target and the coefficients. The second of these steps makes second derivatives exact.
+    """Find the points (B, N, 2) that a lens maps to ``target``, and tell which points exist. A missing point is 0."""
+    # A Newton step is at most about half the distance of the target from the centre. Two steps after the loop let
+    # gradients flow to the target and the coefficients. The second of these steps makes second derivatives exact.
     with torch.no_grad():
         point = target
         longest = 0.5 * (target.norm(dim=-1, keepdim=True) + 1e-3)
@@ -305,7 +305,7 @@ def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, T
 
 
 def _linearised(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:
-    """Values (B, N, 2) and central-difference Jacobians (B, N, 2, 2) of a pointwise function, in one call."""
+    """Call a pointwise function once, and return values (B, N, 2) and central-difference Jacobians (B, N, 2, 2)."""
     size = torch.finfo(point.dtype).eps ** (1 / 3)
     u, v = size * torch.eye(2, dtype=point.dtype, device=point.device)
     moved = torch.cat((point, point + u, point - u, point + v, point - v), 1)
@@ -314,7 +314,7 @@ def _linearised(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Te
 
 
 def _inverse(matrices: Tensor) -> Tensor:
-    """Inverses of 2 by 2 matrices; 0 for a singular matrix."""
+    """Invert 2 by 2 matrices. A singular matrix gives 0."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrices.unbind(-2))
     determinant = a * d - b * c
     determinant = torch.where(determinant.abs() > torch.finfo(matrices.dtype).eps, determinant, torch.inf)

@@ -1,4 +1,4 @@
-"""Covariance of a pose: how accurate the pose is, given the noise of its correspondences."""
+"""Compute the covariance of a pose from the noise of the correspondences."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ __all__ = ["pose_covariance", "shown_noise"]
 # An information matrix with a unit diagonal is regular if its least eigenvalue exceeds this number. Smaller eigenvalues
 # are rounding errors of float64.
 _LEAST_EIGENVALUE = 1e-13
-# The given focal length may differ by this factor from the focal length that fits the pixels at the pose. A larger
-# factor shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
+# The given focal length may differ by at most this factor from the focal length that fits the pixels at the pose. A
+# larger factor shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
 _FOCAL_RATIO = 1.5
-# `shown_noise` tries these shares of the pixel noise in the mean variance of a pixel. The rest is noise of the points.
+# Shares of pixel noise in the mean variance of a pixel, tried by `shown_noise`. The rest is due to the points' noise.
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
@@ -46,13 +46,13 @@ def pose_covariance(
     focal: str = "known",
     focal_sigma: float | None = None,
 ) -> Tensor:
-    r"""First-order covariance of a pose found by weighted least squares.
+    r"""Compute the first-order covariance of a pose that was found by weighted least squares.
 
     The covariance is :math:`(\sum_i w_i J_i^\top \Sigma_i^{-1} J_i)^{-1}`. :math:`J_i` is the derivative of pixel
     :math:`i` with respect to the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`.
     If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with the Cayley
     transform cay. :math:`\Sigma_i` is the covariance of the pixel, see
-    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. All steps run in float64, with gradients to all arguments.
+    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. All steps run in float64. Gradients flow to all arguments.
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
     least squares on the inliers (P. Huber, "Robust Statistics", 1981). The weights are therefore divided by their mean
@@ -63,23 +63,23 @@ def pose_covariance(
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`, also for dimensions and dtypes.
         img_points: pixels; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
-        img_sigma: see ``PnPNet.forward``; required without ``img_cov``.
-        world_sigma: see ``PnPNet.forward``. World points without ``world_sigma`` and ``world_cov`` are exact.
+        img_sigma: see ``PnPNet.forward``; required if ``img_cov`` is ``None``.
+        world_sigma: see ``PnPNet.forward``. If ``world_sigma`` and ``world_cov`` are ``None``, world points are exact.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
         weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as ``result.inliers.double()``.
             ``None``: 1 for every pair.
-        prior: the prior of the solver's call, whose information is added to the information of the pairs.
+        prior: the prior of the solver's call. The prior's information is added to the information of the pairs.
         focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
-            ``intrinsics`` of the result, not those of the solver's call.
-        focal_sigma: the solver's ``focal_sigma``, whose information is added to the information of the pairs.
+            ``intrinsics`` of the result, not the ``intrinsics`` of the solver's call.
+        focal_sigma: the solver's ``focal_sigma``. This prior's information is added to the information of the pairs.
 
     Returns:
         The covariance in radians and the unit of the world, shape :math:`(B, 6, 6)`, with the dtype of a solver's
         result. With an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the
         logarithm of the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the
         diagonal is infinite and all other entries are 0. The same holds if ``focal`` is ``"unknown"`` and the given
-        focal length differs by more than a factor of 1.5 from the focal length that the pixels show at the pose.
+        focal length differs by more than a factor of 1.5 from the focal length that fits the pixels at the pose.
 
     Raises:
         BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` has another value,
@@ -145,7 +145,7 @@ def pose_covariance(
         determined = (determined & is_definite & correlation.isfinite().all((1, 2)))[:, None, None]
     inverse = torch.linalg.inv_ex(torch.where(determined, matrix, eye)).inverse
 
-    # Convert to the caller's world, in which omega is the same, and v = size v_framed + (R centroid) x omega.
+    # Convert to the caller's world: omega stays the same, and v = size * v_framed + (R centroid) x omega.
     rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
     back = eye.repeat(len(matrix), 1, 1)
     back[:, 3:6, :3] = So3.hat(rotated_centroid)
@@ -163,10 +163,10 @@ def shown_noise(
 ) -> dict[str, Tensor]:
     """Estimate the noise of pixels and points from the residuals at a pose.
 
-    The noise of a point moves its pixel less if the depth is larger. The noise of a pixel does not depend on the depth.
-    Five mixtures of pixel noise and point noise are compared. The mixture with the largest Gaussian likelihood is used.
+    At a larger depth, the noise of a point moves the point's pixel less. The noise of a pixel does not depend on the
+    depth. Of five mixtures of pixel noise and point noise, the mixture with the largest Gaussian likelihood is used.
 
-    For arguments see :func:`pose_covariance`. Returns a dict of ``img_sigma`` and ``world_sigma``, shape :math:`(B,)`.
+    See :func:`pose_covariance` for the arguments. The returned dict has ``img_sigma`` and ``world_sigma``, shape (B,).
     """
     size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose")
     dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
@@ -174,7 +174,7 @@ def shown_noise(
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
-    # Variances of the pixels if the points have noise with the standard deviation 1, and the pixels are exact.
+    # Variances of the pixels if the noise of the points has the standard deviation 1, and the pixels are exact.
     of_points = pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
     mean = (weights * of_points).sum(1) / total
     share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)

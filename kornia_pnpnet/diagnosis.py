@@ -1,4 +1,4 @@
-"""Find out which wrong convention makes the pairs disagree with the expected pose, or with every pose."""
+"""Find out which mistake in a convention makes the pairs disagree with the expected pose, or with every pose."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["Diagnosis", "Trial", "diagnose"]
 
-# Trials are equally good if their evidence per pair differs by less than this number. A noise of 1.28 px in place of
-# 1 px causes this difference.
+# Trials are equally good if their evidence per pair differs by less than this number. Pixel noise of 1.28 px
+# instead of 1 px causes this difference.
 _EQUAL = 0.5
 
 
 class Trial(NamedTuple):
-    """Agreement of the pairs with the best pose after one change of the input. Numbers are medians over the batch."""
+    """Agreement of the pairs with a pose after one change of the input. Numbers are medians over the batch."""
 
     change: str  #: Description of the change.
     evidence: float  #: Evidence for the pose, divided by the number of pairs, see :mod:`kornia_pnpnet.judge.evidence`.
@@ -36,10 +36,10 @@ class Trial(NamedTuple):
 
 
 class Diagnosis(NamedTuple):
-    """The result of :func:`diagnose`. Its ``str`` is one sentence."""
+    """The result of :func:`diagnose`. The ``str`` of the result is one sentence."""
 
     trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
-    #: The equally good ``ok`` trials. If one of these trials leaves the pairs unchanged, it excludes the other trials.
+    #: The equally good ``ok`` trials. If any of these leaves the pairs unchanged, only the first such trial is kept.
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:
@@ -71,7 +71,7 @@ def diagnose(
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. All problems of a batch must
             have the same convention.
         img_points: pixels; see ``PnPNet.forward``.
-        intrinsics: see ``PnPNet.forward``. The largest pixel coordinates stand for the size of the image.
+        intrinsics: see ``PnPNet.forward``. The largest pixel coordinates are used as the size of the image.
         pose: the expected pose. If ``None``, any pose is accepted.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Export solvers with ``torch.export``, as ahead-of-time packages, and as ONNX models."""
+"""Export solvers as programs of ``torch.export``, as ahead-of-time packages, and as ONNX models."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ExportedResult(NamedTuple):
     Attributes:
         rotation: shape :math:`(B, 3, 3)`.
         translation: shape :math:`(B, 3)`.
-        pair_weights: the result's ``weights``, shape :math:`(B, N)`. ONNX forbids an output with the name of an input.
+        pair_weights: the result's ``weights``, shape :math:`(B, N)`. In ONNX, inputs and outputs cannot share names.
         cost: shape :math:`(B,)`.
         ok: bool, shape :math:`(B,)`.
     """
@@ -59,7 +59,7 @@ class ExportedResult(NamedTuple):
 
 
 class ExportedCamera(NamedTuple):
-    """The fields of :class:`ExportedResult`, then ``camera``: the result's ``intrinsics``, shape :math:`(B, 3, 3)`."""
+    """The fields of :class:`ExportedResult`, and ``camera`` (the result's ``intrinsics``, shape :math:`(B, 3, 3)`)."""
 
     rotation: Tensor
     translation: Tensor
@@ -73,13 +73,13 @@ class ExportedCamera(NamedTuple):
 INPUTS = ("world_points", "img_points", "intrinsics", "weights")
 #: Names of the inputs of a solver that was exported for rigs.
 RIG_INPUTS = (*INPUTS, "rig_rotation", "rig_translation")
-#: Names of the outputs of a solver with a known focal length.
+#: Names of the outputs of an exported solver if the focal length is known.
 OUTPUTS = ExportedResult._fields
 # Upper bounds of the dynamic dimensions. With finite ranges, torch.export can simplify its guards.
 _MAX_BATCH, _MAX_N = 2**20, 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
-# Name of the only model in a package of one model, and folder of all models in the archive of a package.
+# `_MODEL` names the only model unless `n` is a sequence. `_MODELS` is the folder of all models in a package.
 _MODEL, _MODELS = "model", "/data/aotinductor/"
 
 
@@ -106,15 +106,15 @@ def export_program(
 
     Args:
         solver: a solver whose initialiser is not RANSAC. The program always uses ``effort="fixed"``.
-        n: number of pairs per problem. ``None`` means the number for which the network was built. If the network was
-            built for no particular number, ``None`` means every number of at least 4.
+        n: number of pairs per problem. ``None`` means the number for which the network was built. If the solver accepts
+            any number of pairs, ``None`` means any number from 4 on.
         batch: number of problems in each call; ``None`` means any number. A compiler can optimise for a fixed number.
         rig: whether the program solves problems of rigs (several cameras with one pose).
 
     Returns:
         A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, or of :class:`ExportedCamera` if
-        the focal length is unknown. Inputs have the shapes of ``PnPNet.forward``. Pairs of padding need the weight 0. A
-        program for rigs takes :data:`RIG_INPUTS`, with a camera matrix for each pair, :math:`(B, N, 3, 3)`.
+        the focal length is unknown. Inputs have the shapes of ``PnPNet.forward``. Padding needs the weight 0. A program
+        for rigs takes :data:`RIG_INPUTS`. Then ``intrinsics`` has a matrix for each pair, :math:`(B, N, 3, 3)`.
 
     Raises:
         BaseError: when ``n`` is less than 3 or not the number that the network was built for, or when ``batch`` is less
@@ -195,16 +195,16 @@ def export_package(
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
     :func:`load_package` loads the package without tracing or compiling. C++ programs need only libtorch to load a
-    package. A package runs on one thread, with the version of PyTorch that compiled it, on a CPU with the instruction
-    sets (for example AVX-512) of the CPU that compiled it. Compiling takes minutes. An existing file is replaced only
-    when the package is complete.
+    package. A package runs on one thread. A package needs the PyTorch version of the compiling machine, and a CPU that
+    has all instruction sets (for example AVX-512) of the compiling machine. Compiling takes minutes. An existing file
+    is replaced only when the package is complete.
 
-    A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
-    packages. With PyTorch's own loader, a call of such a package overwrites the previous result of the same thread.
+    With ``batch=1`` and a fixed number of pairs, one problem takes a fraction of the time of a general package. If
+    PyTorch's own loader runs this faster package, each call overwrites the previous result of the same thread.
 
-    If ``n`` has several numbers of pairs, such as ``(16, 64, 256)``, the package holds a model for each number, and a
-    problem is padded to the next of these numbers. C++ programs choose a model by the model's name: "n16" is the model
-    for 16 pairs. The name of a single model is "model".
+    If ``n`` is a sequence of numbers, such as ``(16, 64, 256)``, the package holds a model for each number, and each
+    problem is padded to the next of these numbers. C++ programs choose a model by name: the model for 16 pairs is
+    "n16". If ``n`` is a single number or ``None``, the only model is "model".
 
     Returns:
         The path, which must end in ``.pt2``.
@@ -250,8 +250,8 @@ class PackagedSolver:
 
     Attributes:
         batch: number of problems in each call; ``None``: any number.
-        sizes: the numbers of pairs for which the package has models, in increasing order; empty for any number from 4.
-            With several models, each problem is padded and solved by the smallest model that is large enough.
+        sizes: the numbers of pairs for which the package has models, in increasing order; empty if one model takes any
+            number from 4 on. With several models, the smallest one that is large enough solves the padded problem.
         rig: whether the package solves problems of rigs.
     """
 
@@ -272,11 +272,11 @@ class PackagedSolver:
         *,
         cam_from_rig: Pose | None = None,
     ) -> ExportedResult | ExportedCamera:
-        """Solve a batch of problems. See PnPNet.forward. A package for rigs requires ``cam_from_rig``.
+        """Solve a batch of problems. See ``PnPNet.forward``. A package for rigs requires ``cam_from_rig``.
 
         Raises:
             ShapeError: when a shape differs from the shapes for which the package was compiled.
-            ValueCheckError: when ``cam_from_rig`` is missing for a package for rigs, or given to any other package.
+            ValueCheckError: when a package for rigs gets no ``cam_from_rig``, or any other package gets one.
         """
         if self.rig != (cam_from_rig is not None):
             raise ValueCheckError(f"This package {'needs' if self.rig else 'does not take'} cam_from_rig.")
@@ -302,7 +302,7 @@ class PackagedSolver:
 
 
 def load_package(path: str | Path) -> PackagedSolver:
-    """Load a solver that :func:`export_package` compiled, without tracing or compiling.
+    """Load a solver that :func:`export_package` compiled. Loading neither traces nor compiles.
 
     A package is machine code: load only packages that you trust.
 
@@ -325,7 +325,7 @@ def load_package(path: str | Path) -> PackagedSolver:
 def export_onnx(
     solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
 ) -> Path:
-    """Write a solver to one file as an ONNX model, for ONNX Runtime without PyTorch, and return the path.
+    """Write a solver to one file as an ONNX model, and return the path. ONNX Runtime needs no PyTorch.
 
     See :func:`export_program` for the arguments, inputs, outputs and errors. Without the extra ``onnx``, the function
     raises ``ImportError``. An existing file is replaced only when the model is complete.
@@ -350,7 +350,7 @@ def export_onnx(
 
 
 def _simplify(model: Any) -> None:
-    """Simplify a model with the passes of ``torch.onnx.export(optimize=True)`` except the rewrite rules."""
+    """Simplify a model. The passes are those of ``torch.onnx.export(optimize=True)`` except the rewrite rules."""
     # The rewrite rules would take 90 % of the time of all passes, but remove only 5 % of the nodes.
     from onnx_ir.passes import Sequential, common
     from onnxscript import optimizer

@@ -1,4 +1,4 @@
-r"""Normalisation of problems: the transform from the caller's frame to the solver's frame, and its inverse."""
+r"""Normalise problems: transform them from the caller's frame to the solver's frame, and transform poses back."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ __all__ = ["F_CONST", "Frame", "Normalize", "scaled_cameras"]
 F_CONST = 3400.0
 # Limit of the entries of given poses. Fourth powers of entries must be finite in float32, the dtype of the networks.
 _LARGEST_ENTRY = torch.finfo(torch.float32).max ** 0.25
-# Centre and scale ignore points more than `_FAR` typical distances (see `Normalize`) from the median. With fewer than
-# `_MANY` pairs, the limit is `_FAR_OF_FEW`, because the typical distance of few points is inaccurate.
+# Centre and scale ignore points that are farther than `_FAR` typical distances (see `Normalize`) from the median. For
+# fewer than `_MANY` pairs, the limit is `_FAR_OF_FEW`, because the typical distance of few points is inaccurate.
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
 # Points beyond this number of typical distances from the median lose their weight, because float32 has too few digits.
 _LARGEST_DISTANCE = 1e6
-# A confidence (such as a cosine of descriptors) may leave [0, 1] by less than this number, because of rounding.
+# A confidence may be outside [0, 1] by less than this number, because cosines of descriptors have rounding errors.
 _ROUNDING = 1e-3
 # Tangent of 85 degrees. A real lens that is free of distortion does not see rays at larger angles to the axis.
 _FAR_ANGLE = 11.4
@@ -40,14 +40,14 @@ class Frame(NamedTuple):
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
-        img_scale: number of pixels of the problem per pixel of the caller, shape :math:`(B,)`. The number is the
-            geometric mean of the absolute scales of u and v, in a rig averaged over the pairs.
+        img_scale: number of pixels of the problem per pixel of the caller (geometric mean of the absolute scales of u
+            and v), shape :math:`(B,)`. In a rig, the number is the mean over the pairs.
         order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
-        intrinsics: the camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`, in a rig
-            :math:`(B, N, 3, 3)`. The identity replaces invalid matrices.
-        ignored: ``Status.INIT`` if an invalid initial pose was ignored, else ``Status.CONFIDENCE`` if pairs of invalid
-            confidence were left out, else ``Status.SOLVED``, int64, shape :math:`(B,)`; ``None``: neither was given.
+        intrinsics: the camera matrices, scaled to a last entry of 1, shape :math:`(B, 3, 3)`, or :math:`(B, N, 3, 3)`
+            in a rig. The identity replaces invalid matrices.
+        ignored: ``Status.INIT`` if an invalid ``init`` was ignored, else ``Status.CONFIDENCE`` if pairs with an invalid
+            ``confidence`` were left out, else ``Status.SOLVED``, int64, shape :math:`(B,)`; ``None``: neither is given.
     """
 
     centroid: Tensor
@@ -64,12 +64,12 @@ class Frame(NamedTuple):
         return self.status == Status.SOLVED.value
 
     def apply(self, pose: Pose) -> Pose:
-        r"""Express a pose in the frame of the problem: :math:`(R,\; (t + R c) / s)` with size s and centroid c."""
+        r"""Express a pose in the problem's frame, :math:`(R,\; (t + R c) / s)`, for the size s and the centroid c."""
         offset = (pose.rotation * self.centroid[:, None]).sum(-1)
         return Pose(pose.rotation, (pose.translation + offset) / self.size[:, None])
 
     def undo(self, pose: Pose) -> Pose:
-        r"""Express a pose in the caller's world, the inverse of :meth:`apply`: :math:`(R,\; s t - R c)`.
+        r"""Invert :meth:`apply`: express a pose in the caller's world, :math:`(R,\; s t - R c)`.
 
         Each problem may have several poses, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
         """
@@ -82,7 +82,7 @@ class Frame(NamedTuple):
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
     def undo_starts(self, starts: Starts) -> Starts:
-        """Express starts in the caller's frame, order and units. The new ``ok`` is :attr:`valid`."""
+        """Express starts in the caller's frame, order and units. The ``ok`` of the new starts is :attr:`valid`."""
         noise = starts.noise
         if noise is not None:
             noise = Noise(noise.img / self.img_scale[:, None], noise.world * self.size[:, None])
@@ -106,8 +106,8 @@ class Normalize(Configured):
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
     with or without skew). At least three of its pairs have a positive weight. Its points deviate from any line by more
-    than the rounding of coordinates. The inputs of invalid problems are replaced by zeros, so that all later values and
-    gradients are finite. A pair of weight 0 is padding. The coordinates of padding are ignored.
+    than the rounding errors of the coordinates. Zeros replace the inputs of invalid problems, so that all later values
+    and gradients are finite. A pair with the weight 0 is padding. The coordinates of padding are ignored.
 
     Centroid and scale are computed from the *usual* pairs, so that bad triangulations and bad detections do not spoil
     the frame. The pixel of a usual pair is less than 85° off the camera's axis. The point of a usual pair is at most
@@ -156,7 +156,7 @@ class Normalize(Configured):
         confidence: Tensor | None = None,
         rig: Pose | None = None,
     ) -> tuple[Problem, Frame]:
-        r"""Normalise a batch. In memory, the batch is the last dimension of the problem.
+        r"""Normalise a batch. In memory, the batch is the last dimension of the problem's tensors.
 
         Args:
             world_points: shape :math:`(B, N, 3)`.
@@ -165,7 +165,7 @@ class Normalize(Configured):
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
             noise: noise of each pair, in pixels and in the unit of the world.
-            confidence: see :class:`~kornia_pnpnet.problem.Problem`. Pairs with a value outside of [0, 1] are left out.
+            confidence: see :class:`~kornia_pnpnet.problem.Problem`. Pairs whose value is outside [0, 1] are left out.
             rig: see :class:`~kornia_pnpnet.problem.Problem`.
         """
         (batch, count), left_out = world_points.shape[:2], None
@@ -197,14 +197,14 @@ class Normalize(Configured):
         sizes = rows.detach().abs()
         if padded:
             sizes = torch.where(given, sizes, zero)
-        # The sum of `sizes` is tested, because the maximum of ONNX Runtime ignores NaN. Sums must not overflow.
+        # The test uses a sum, because the maximum of ONNX Runtime ignores NaN, and because later sums must be finite.
         is_finite = sizes.sum((0, 1), dtype=torch.float64) < limits.max
         if padded:
             is_finite = is_finite & ((rows[5] >= 0) & (rows[5] < limit)).all(0)
         if rig is not None:
             is_camera = (is_camera | ~given).all(0)
         there = given & (is_camera & is_finite) & (sizes[3:5].amax(0) < limit)
-        # A pair at an impossible distance or angle loses its weight, but its problem stays valid.
+        # A pair loses its weight if its distance or angle is impossible. The problem stays valid.
         distance, typical = _distances(rows[:3].detach(), there, padded)
         there = there & (distance <= _LARGEST_DISTANCE * typical)
         rows = torch.where(there, rows, zero)  # all numbers are finite now, also in the unit of the typical distance
@@ -274,7 +274,7 @@ class Normalize(Configured):
             sound = (there & has_noise).mT
 
             def scaled(sigma: Tensor, unit: Tensor) -> Tensor:
-                """Divide sigmas. Unknown sigmas are replaced first, so that the gradient of the unit is not NaN."""
+                """Divide sigmas by a unit. Unknown sigmas are replaced first: the unit's gradient must not be NaN."""
                 known = sound & ~sigma.isnan()
                 return torch.where(known, torch.where(known, sigma, 0.0) / unit, torch.nan)
 
@@ -317,7 +317,7 @@ def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _is_usable(noise: Noise, given: Tensor, size: Tensor) -> Tensor:
-    """Whether each sigma of ``given`` pairs is NaN or in [0, limit), and each covariance semi-definite, bool (B,)."""
+    """Tell whether all ``given`` pairs have sigmas in [0, limit) or NaN, and semi-definite covariances, bool (B,)."""
     limit = torch.finfo(size.dtype).max ** 0.25
     sigmas = noise.img, noise.world.detach() / size[:, None]
     usable = [((x >= 0) & (x < limit)) | x.isnan() for x in sigmas]

@@ -1,4 +1,4 @@
-"""The likelihood of the true pose: a loss that trains points, pixels and their noise."""
+"""The negative log-likelihood of the true pose, a loss for training points, pixels and their noise."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ __all__ = ["monte_carlo_pose_loss"]
 
 # Degrees of freedom of the t distributions. The heavy tails prevent very large importance weights.
 _FREEDOM = 3.0
-# Scale of the prior of the translation, as a share of the distance between camera and points.
+# Scale of the translation's prior, divided by the distance between camera and points.
 _PRIOR_TRANSLATION = 0.5
 # Largest rotational scale of a t distribution, in radians. Tangent vectors approximate larger rotations badly.
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth of a point, divided by the distance to the points. A smaller depth is raised, and the residual penalised.
+# Least depth of a point, divided by the points' distance. Smaller depths are raised to this bound and penalised.
 _LEAST_DEPTH = 0.02
 
 
@@ -59,7 +59,7 @@ def monte_carlo_pose_loss(
 ) -> Tensor:
     r"""Negative log-likelihood of the true pose under the distribution of poses that the correspondences define.
 
-    The likelihood compares the true pose with all other poses. The loss has useful gradients from the first step of a
+    The likelihood compares the true pose with all other poses. The loss has useful gradients already at the start of a
     training, when no pose fits the correspondences. The density of a pose :math:`y` is
     :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted sum of the pairs' robust losses.
     Residuals are in standard deviations. If world points have noise, the cost includes the logarithm of each pixel's
@@ -71,7 +71,7 @@ def monte_carlo_pose_loss(
     distributions: one around the true pose, one around each hypothesis, and one around each of ``rounds`` modes. A mode
     is found by refining the sample with the largest importance weight so far. The precision of a t distribution is the
     matrix of the normal equations at its centre. Gradients flow to all inputs except poses. A problem that a solver
-    would refuse has the loss 0 without gradient.
+    would refuse has the loss 0 and no gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
     4 to 7. This function adds hypotheses and a prior, and uses modes in place of fitted proposals.
@@ -84,14 +84,14 @@ def monte_carlo_pose_loss(
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
         mask: see ``PnPNet.forward``.
-        img_sigma: see ``PnPNet.forward``; required without ``img_cov``. A network can learn to predict ``img_sigma``.
-        world_sigma: see ``PnPNet.forward``. World points are exact without ``world_sigma`` and ``world_cov``.
+        img_sigma: see ``PnPNet.forward``; required if ``img_cov`` is ``None``. The loss can train ``img_sigma``.
+        world_sigma: see ``PnPNet.forward``. If ``world_sigma`` and ``world_cov`` are ``None``, world points are exact.
         img_cov: see ``PnPNet.forward``.
         world_cov: see ``PnPNet.forward``.
         samples: number of poses drawn per problem, rounded down to a multiple of the number of components.
         rounds: number of t distributions around modes.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
-        scale: scale of the kernel in standard deviations, or the exponent of the kernel ``"power"``.
+        scale: scale of the kernel in standard deviations; for the kernel ``"power"``, the exponent.
 
     Returns:
         The loss of each problem in nats, shape :math:`(B,)`. The density is per radian³ and world unit³.
@@ -228,8 +228,8 @@ class _Posterior(NamedTuple):
 
     problem: Problem  # with known noise
     prior: _Prior
-    refine: RobustWeightedLM  # finds modes with the same robust kernel
-    shape: Tensor  # shape parameter of the kernel, a scalar
+    refine: RobustWeightedLM  # finds modes; its robust kernel is also the kernel of the density
+    shape: Tensor  # the kernel's scale or exponent, a scalar
     noisy_points: bool  # whether world points have noise, so that the variance of a pixel depends on the pose
 
     def log_density(self, poses: Pose) -> Tensor:
@@ -283,7 +283,7 @@ class _Posterior(NamedTuple):
 
 
 def _draw(model: _Posterior, poses: Sequence[Pose], each: int, rounds: int) -> tuple[Pose, Tensor]:
-    """Draw samples from the mixture, and compute the logarithm of its density at each sample, (S, B)."""
+    """Draw samples from the mixture, and compute the mixture's log-density at each sample, (S, B)."""
     mixture: list[_Prior | _Component] = [model.prior, *map(model.component, poses)]
     drawn = map_tensors(lambda *x: torch.cat(x), *[part.sample(each) for part in mixture])
 

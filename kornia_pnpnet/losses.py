@@ -35,7 +35,7 @@ _MOST_VARIANCES = 20.0
 class LossTerms(NamedTuple):
     """The loss and its terms. Each field is a scalar, the mean over the batch."""
 
-    total: Tensor  #: Weighted sum of the terms. The refined distances are saturated, see :class:`PoseLoss`.
+    total: Tensor  #: Weighted sum of the terms. In the sum, the refined term is saturated, see :class:`PoseLoss`.
     init_rotation: Tensor  #: Chordal rotation distance of the first guess.
     init_translation: Tensor  #: Translation distance of the first guess, measured at the centroid of the points.
     refined_rotation: Tensor  #: Chordal rotation distance after refinement.
@@ -87,7 +87,7 @@ def _centre(problems: Problems) -> Tensor:
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class PoseLoss(nn.Module):
-    r"""Weighted sum of the rotation and translation distances of the first guess and of the refined pose.
+    r"""Weighted sum of rotation and translation distances, for the first guess and for the refined pose.
 
     Refined translations are compared at the world's origin, as in :func:`~kornia_pnpnet.metrics.pose_errors`.
     Translations of the first guess are compared at the centroid of the points. At a distant origin, the translation
@@ -161,7 +161,7 @@ class SetLoss(nn.Module):
         starts: number of the network's hypotheses, which are the first poses of ``guess``.
         every: weight of the mean distance of all hypotheses. The best hypothesis has the weight ``1 - every``.
         refined: weight of the refined term, for ``ramp=1``.
-        saturation: :math:`c` of :class:`PoseLoss` for the sum of the refined pose.
+        saturation: :math:`c` of the refined term, see :class:`PoseLoss`.
         weights: weight of the cross entropy.
         noise: weight of the negative log-likelihood.
         rotation_unit: largest rotation error of a success, in degrees.

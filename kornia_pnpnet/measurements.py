@@ -1,4 +1,4 @@
-"""Make inputs of a solver with covariances: pixels from heat maps, and world points from pixels with depth."""
+"""Make a solver's inputs and their covariances: pixels from heat maps, and world points from pixels with depth."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def heatmap_keypoints(
     r"""Compute a keypoint and its covariance for each heat map: the mean and the covariance of the map's softmax.
 
     The softmax of a map is a density that is constant in each cell. The mean of this density is Kornia's soft-argmax.
-    The covariance is that of the cells' centres plus the variance of a cell, 1/12 per axis (Sheppard's correction), and
-    is thus positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
+    The variance of a cell, 1/12 per axis, is added to the covariance of the cells' centres (Sheppard's correction). The
+    sum is positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
 
     Convention:
         Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
@@ -108,30 +108,30 @@ def depth_points(
 ) -> tuple[Tensor, Tensor]:
     r"""Compute world points and their covariances from pixels with depth, for example in an RGB-D image.
 
-    A pixel :math:`(u, v)` with the depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)` with
-    :math:`r = K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
-    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`, where :math:`A` is the
-    derivative of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel.
+    A pixel :math:`(u, v)` of depth :math:`d` shows the point :math:`x = R^\top (d\,r - t)`, where :math:`r` is the ray
+    :math:`K^{-1} (u, v, 1)^\top`. If the errors of pixel and depth are independent, the covariance of :math:`x` is
+    exactly :math:`R^\top ((d^2 + \sigma_d^2)\, A \Sigma A^\top + \sigma_d^2\, r r^\top) R`. :math:`A` is the derivative
+    of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel.
 
     Args:
         img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`, with any leading dimensions.
         depth: depth along the camera's z axis in the unit of the world, shape :math:`(B, N)`.
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`. The
-            nearest rotation replaces a matrix that is no exact rotation.
-        depth_sigma: standard deviation of the depth in the unit of the world, a number, :math:`(B,)` or :math:`(B, N)`.
+            nearest rotation replaces a matrix that is not exactly a rotation.
+        depth_sigma: standard deviation of ``depth`` in the same unit, a number or shape :math:`(B,)` or :math:`(B, N)`.
         img_sigma: see ``PnPNet.forward``. Pixels are exact if neither ``img_sigma`` nor ``img_cov`` is given.
         img_cov: see ``PnPNet.forward``.
 
     Returns:
-        A solver's ``world_points``, shape :math:`(B, N, 3)`, and its ``world_cov`` in squared units of the world, shape
+        A solver's ``world_points``, shape :math:`(B, N, 3)`, and ``world_cov`` in squared units of the world, shape
         :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its sigma is negative, or
         its camera or pose is invalid. The same holds if one of its numbers is not finite, or is so large that its
         fourth power overflows. Exclude such a pair with the solver's ``mask``; otherwise its problem is not ``ok``.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma
-            that is neither a number nor a tensor, or both ``img_sigma`` and ``img_cov``.
+            that is neither a number nor a tensor, or ``img_sigma`` together with ``img_cov``.
 
     Example:
         >>> camera = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
@@ -181,7 +181,7 @@ def depth_points(
     if img_cov is not None:
         noise = torch.where(sound[..., None, None], img_cov.to(dtype), eye[:2, :2])
 
-    # Rays in the axes of the world. Kornia's unprojection is not used, because it ignores the skew.
+    # The coordinates of rays are in the world's axes. Kornia's unprojection is not used, because it ignores the skew.
     back = rotation.mT @ torch.linalg.inv_ex(camera).inverse  # (B, 3, 3)
     rays = convert_points_to_homogeneous(pixels) @ back.mT  # (B, N, 3)
     points = depth[..., None] * rays - translation[..., None, :] @ rotation

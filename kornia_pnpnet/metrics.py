@@ -44,7 +44,7 @@ class SuccessRate(NamedTuple):
 class Reliability(NamedTuple):
     r"""Predicted probabilities and observed frequencies in :math:`K` equally wide bins of probability."""
 
-    number: Tensor  #: Number of predictions, shape :math:`(K,)`.
+    number: Tensor  #: Number of predictions in each bin, shape :math:`(K,)`.
     predicted: Tensor  #: Mean predicted probability, NaN for an empty bin, shape :math:`(K,)`.
     observed: Tensor  #: Share of true outcomes, NaN for an empty bin, shape :math:`(K,)`.
 
@@ -90,7 +90,7 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
 
 @full_precision
 def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
-    r"""Errors of estimated poses. Rotations have the shape :math:`(B, 3, 3)`, and translations :math:`(B, 3)`.
+    r"""Compute pose errors. Rotations have the shape :math:`(B, 3, 3)`, and translations :math:`(B, 3)`.
 
     Raises:
         BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.
@@ -107,7 +107,7 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
 
 
 def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: float | Tensor = 0.2) -> Tensor:
-    r"""Whether the errors of rotation and translation are both below their limits, bool :math:`(B,)`. False for NaN.
+    r"""Tell whether both errors of each pose are below their limits, bool :math:`(B,)`. NaN is not below a limit.
 
     Args:
         errors: the errors of :math:`B` poses.
@@ -115,7 +115,7 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         max_translation: limit of the translation error in the unit of the world, a number or :math:`(B,)`.
 
     Raises:
-        BaseError: when tensors are on different devices, or have other shapes.
+        BaseError: when tensors are on different devices, or when a shape is not as above.
 
     Example:
         >>> success(PoseErrors(torch.tensor([0.5, 0.5, 2.0]), torch.tensor([0.1, 0.3, 0.1])))

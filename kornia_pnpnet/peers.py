@@ -1,6 +1,6 @@
-"""Peers: solvers of other libraries with the call signature of PnPNet, for comparisons on the same problems.
+"""Peers give solvers of other libraries the call signature of PnPNet, to compare solvers on the same problems.
 
-The constructor of a solver imports the solver's library.
+The constructor of a peer imports the library.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 
 __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]
 
-# Rows and columns of fx, fy, cx and cy in a camera matrix: the parameters of ``PINHOLE`` of COLMAP and PoseLib.
+# Rows and columns, in a camera matrix, of the ``PINHOLE`` parameters fx, fy, cx and cy of COLMAP and PoseLib.
 _PINHOLE = (0, 1, 0, 1), (0, 1, 2, 2)
 
 
@@ -44,10 +44,10 @@ class PeerPose(NamedTuple):
 class PeerSolver(nn.Module):
     r"""A batched layer around a solver of another library. The library solves one problem at a time.
 
-    A subclass is a dataclass with the arguments of the constructor as fields, and implements :meth:`solve_one`. The
-    library gets the pairs that are not padding and have a weight above 0, but gets no weights. If no pose is found,
-    ``ok`` is false, and the pose is the identity. A problem is not solved if it has fewer than three pairs, a negative
-    weight, a value that is not finite, or a camera with skew or a focal length of 0.
+    A subclass implements :meth:`solve_one`, and is a dataclass whose fields are the arguments of the constructor. The
+    library gets the pairs of positive weight that are not padding, but gets no weights. If no pose is found, ``ok`` is
+    false, and the pose is the identity. A problem is not solved if it has fewer than three such pairs, a negative
+    weight, a value that is not finite, or an invalid camera, for example with skew or a focal length of 0.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
@@ -115,7 +115,7 @@ class PeerSolver(nn.Module):
         used = present & (shares > 0)
         cameras, pinhole = pinholes(cameras)
         pinhole &= (cameras[:, (0, 1, 2, 2), (1, 0, 0, 1)] == 0).all(-1)  # no peer supports skew
-        # An image with a negative focal length is reflected, because not every peer supports such a camera.
+        # If a focal length is negative, the pixels are reflected, because not every peer supports such cameras.
         signs = cameras.diagonal(dim1=1, dim2=2).sign()
         img, cameras = img * signs[:, None, :2], signs[..., None] * cameras
         sound = world.isfinite().all(-1) & img.isfinite().all(-1) & shares.isfinite() & (shares >= 0) | ~present
@@ -216,7 +216,7 @@ class _OpenCV(PeerSolver):
 
 @dataclass(eq=False, kw_only=True)
 class OpenCVPnP(_OpenCV):
-    r"""OpenCV's ``solvePnP`` on all pairs, problem by problem. All pairs are inliers, and the cost is not truncated.
+    r"""OpenCV's ``solvePnP`` on all pairs, problem by problem. Every pair is an inlier. The cost is not truncated.
 
     Args:
         method: OpenCV's name of the solver, for example ``"EPNP"`` for ``SOLVEPNP_EPNP``.
@@ -241,11 +241,11 @@ class OpenCVRansac(_OpenCV, RobustPeer):
     Args:
         threshold: largest reprojection error, in pixels, of an inlier.
         iterations: largest number of RANSAC iterations.
-        confidence: RANSAC stops when a sample without outliers was drawn with at least this probability, in (0, 1).
-        method: the solver for minimal samples, by OpenCV's name, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
-        refine: whether to refine RANSAC's pose by least squares of the inliers' reprojection errors. The field ``init``
-            of the result is the pose before this refinement.
-        seed: seed of OpenCV's global random numbers, set before each problem.
+        confidence: number in (0, 1). RANSAC stops when a sample without outliers was drawn with this probability.
+        method: OpenCV's name of the solver for minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
+        refine: whether to minimise the inliers' squared reprojection errors, starting from RANSAC's pose. The field
+            ``init`` of the result is the pose before this refinement.
+        seed: seed of OpenCV's global random number generator, set before each problem.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -279,7 +279,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
 
 @dataclass(eq=False, kw_only=True)
 class OpenCVUsac(OpenCVRansac):
-    r"""A USAC variant of OpenCV's ``solvePnPRansac``, with its own refinement. See :class:`OpenCVRansac`.
+    r"""A USAC variant of OpenCV's ``solvePnPRansac``, which includes a refinement. See :class:`OpenCVRansac`.
 
     Args:
         method: OpenCV's name of the variant. ``USAC_PROSAC`` expects the pairs sorted from the best to the worst.
@@ -293,15 +293,15 @@ class OpenCVUsac(OpenCVRansac):
 
 @dataclass(eq=False, kw_only=True)
 class KorniaRs(RobustPeer):
-    r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: P3P, RANSAC, then least squares of the inliers.
+    r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: RANSAC with P3P, then least squares on the inliers.
 
-    kornia-rs computes in float32. The local optimisation of kornia-rs is off, because it does not increase the number
-    of solved ``SyntheticProblems``. For ``threshold``, ``confidence``, ``seed`` and the tuning of the default
+    kornia-rs computes in float32. Its local optimisation is off, because local optimisation does not increase the
+    number of solved ``SyntheticProblems``. For ``threshold``, ``confidence``, ``seed`` and the tuning of the default
     threshold, see :class:`OpenCVRansac`.
 
     Args:
         max_iterations: largest number of RANSAC iterations.
-        method: the solver for minimal samples, by kornia-rs's name: ``"AP3P"`` or ``"EPnP"``.
+        method: kornia-rs's name of the solver for minimal samples, ``"AP3P"`` or ``"EPnP"``.
     """
 
     threshold: float = 40.0
@@ -327,13 +327,13 @@ class KorniaRs(RobustPeer):
 
 @dataclass(eq=False, kw_only=True)
 class PoseLib(RobustPeer):
-    r"""PoseLib's ``estimate_absolute_pose``, problem by problem: P3P, LO-RANSAC and a robust refinement of the inliers.
+    r"""PoseLib's ``estimate_absolute_pose``, problem by problem: LO-RANSAC (P3P), then a robust refinement on inliers.
 
     For ``threshold``, ``confidence``, ``seed`` and the tuning of the default threshold, see :class:`OpenCVRansac`.
 
     Args:
         min_iterations: smallest number of RANSAC iterations. PoseLib's default of 1000 is not better for 9 pairs.
-        max_iterations: largest number of RANSAC iterations. A problem without a pose takes this number of iterations.
+        max_iterations: largest number of RANSAC iterations. If no pose is found, RANSAC runs all these iterations.
         progressive_sampling: use PROSAC, which needs pairs that are sorted from the best to the worst.
     """
 
@@ -364,7 +364,7 @@ class PoseLib(RobustPeer):
 
 @dataclass(eq=False, kw_only=True)
 class PyColmap(RobustPeer):
-    r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares of the inliers.
+    r"""COLMAP's absolute pose estimation, problem by problem: LO-RANSAC, then robust least squares on the inliers.
 
     For ``threshold``, ``confidence``, ``seed`` and the tuning of the default threshold, see :class:`OpenCVRansac`.
 

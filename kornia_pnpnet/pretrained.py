@@ -53,7 +53,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
 
     Raises:
         FileNotFoundError: see :func:`find_weights`.
-        ValueCheckError: when the files are damaged or do not match.
+        ValueCheckError: when the files are damaged or do not belong together.
     """
     folder = find_weights(name_or_folder)
     from safetensors import SafetensorError, safe_open
@@ -118,7 +118,7 @@ _INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPIn
 
 
 class PretrainedMixin(nn.Module):
-    """The base class of :class:`~kornia_pnpnet.PnPNet` for saving, loading and copying solvers."""
+    """The base class of :class:`~kornia_pnpnet.PnPNet`, which saves, loads and copies solvers."""
 
     init: nn.Module | None
     refine: RobustWeightedLM
@@ -126,7 +126,7 @@ class PretrainedMixin(nn.Module):
 
     @classmethod
     def option_names(cls) -> list[str]:
-        """Names of the options: the keyword-only arguments of the constructor."""
+        """Names of the options, which are the keyword-only arguments of the constructor."""
         parameters = inspect.signature(cls.__init__).parameters.values()
         return [x.name for x in parameters if x.kind is inspect.Parameter.KEYWORD_ONLY]
 
@@ -179,7 +179,7 @@ class PretrainedMixin(nn.Module):
     def from_pretrained(cls, name_or_folder: str | Path) -> Self:
         """Load a trained solver in evaluation mode. Its parameters require gradients.
 
-        The solver can be trained further after ``solver.train()``. For inference alone, use ``torch.no_grad()`` or
+        To train the solver further, call ``solver.train()``. For inference alone, use ``torch.no_grad()`` or
         ``solver.requires_grad_(False)``, or load a shipped solver with :func:`~kornia_pnpnet.create_solver`.
 
         Args:

@@ -29,8 +29,8 @@ class State(NamedTuple):
 
     Attributes:
         pose: world-to-camera poses.
-        camera: unknown parameters of the camera, first :attr:`zoom`, then the coefficients :math:`k_1, k_2` of radial
-            distortion, shape :math:`(B, K)`; :math:`K = 0` for a known camera.
+        camera: unknown parameters of the camera. :attr:`zoom` comes first, then the coefficients :math:`k_1, k_2` of
+            radial distortion, shape :math:`(B, K)`; :math:`K = 0` for a known camera.
     """
 
     pose: Pose
@@ -56,8 +56,8 @@ class Noise(NamedTuple):
     r"""The noise of each pair: isotropic standard deviations, and the covariances that the caller gave.
 
     Attributes:
-        img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. With ``img_cov``,
-            ``img`` is the sigma of isotropic noise with the same trace, because networks ignore ``img_cov``.
+        img: standard deviation of each pixel coordinate, NaN where unknown, shape :math:`(B, N)`. If ``img_cov``
+            is given, ``img`` is the sigma of isotropic noise with the same trace. Networks ignore ``img_cov``.
         world: standard deviation of each world coordinate; see ``img``.
         img_cov: covariance of the pixel, each entry of shape :math:`(B, N)`. ``None``: the noise is isotropic.
         world_cov: covariance of the world point; see ``img_cov``.
@@ -90,7 +90,7 @@ class Inputs(NamedTuple):
         intrinsics: in a rig, a camera matrix for each pair, :math:`(B, N, 3, 3)`.
         noise: noise of every pair, NaN where unknown; ``None``: the caller gave no noise.
         rig: the transform from the rig to the camera of each pair.
-        free_focal: range and prior, in the caller's pixels, of an unknown focal length, see :class:`Problem`.
+        free_focal: range and prior of an unknown focal length in the caller's pixels, see :class:`Problem`.
         radial: coefficients of the radial distortion that ``with_found_focal`` estimated and removed from the pixels.
     """
 
@@ -135,7 +135,7 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty, added to losses in the search, for poses that differ from the prior. The unit is an outlier's loss.
+        """Penalty that searches add to the loss of a pose that differs from the prior. The unit is an outlier's loss.
 
         The batch of the poses, for example :math:`(H, B)` or :math:`(P, H)`, broadcasts with the batch of the term.
         """
@@ -148,9 +148,9 @@ class Problem(NamedTuple):
         world_points: points of the (possibly centred and scaled) world, shape :math:`(B, N, 3)`.
         img_points: pixels of a camera with focal length ``focal`` and principal point 0, shape :math:`(B, N, 2)`.
         weights: weight of each pair, at least 0, and 0 for padding, shape :math:`(B, N)`.
-        focal: the focal length in pixels (its initial value if it is unknown), a scalar that all problems share.
-        img_scale: pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
-        world_scale: units of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
+        focal: the focal length in pixels (if unknown, the initial value), a scalar that all problems share.
+        img_scale: number of pixels of ``img_points`` per pixel of the caller, shape :math:`(B,)`.
+        world_scale: number of units of ``world_points`` per unit of the caller's world, shape :math:`(B,)`.
         usual: 1 for usual pairs (see :class:`~kornia_pnpnet.frame.Normalize`), else 0, shape :math:`(B, N)`.
         noise: noise of each pair in the units of ``img_points`` and ``world_points``, NaN where unknown.
         confidence: the caller's belief, in [0, 1], that a pair is an inlier, NaN where unknown, shape :math:`(B, N)`.
@@ -189,7 +189,7 @@ class Problem(NamedTuple):
 
     @property
     def camera_terms(self) -> tuple[Term, ...]:
-        """The prior of the camera if the focal length is unknown and ``focal_sigma`` or ``radial`` is given."""
+        """The prior of the camera; empty if neither ``focal_sigma`` nor ``radial`` is given."""
         known = self.free_focal is not None and self.free_focal.information is not None
         return (self.free_focal,) if known else ()
 
@@ -204,7 +204,7 @@ class Problem(NamedTuple):
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
     def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays (B, N, 3) in the rig's frame, of length ``focal``, through points on the planes z = 1 of the cameras."""
+        """Rays (B, N, 3) of length ``focal``, in the rig's frame, through points on the cameras' planes z = 1."""
         assert self.rig is not None
         rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
         rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
@@ -212,7 +212,7 @@ class Problem(NamedTuple):
 
     def seen_with(self, zoom: Tensor) -> Problem:
         """The same pairs with the known focal length ``focal * exp(zoom)``. ``zoom`` has the shape (B, 1) or (B, 0)."""
-        # Pixels and their noise are divided by exp(zoom), because all problems share `focal`.
+        # All problems share `focal`, so exp(zoom) divides pixels and their noise instead.
         if not zoom.shape[1]:
             return self
         factor = (-zoom).exp()

@@ -99,8 +99,8 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
     Every solver is called as ``solver(world_points, img_points, intrinsics, weights=None, mask=None)`` and returns a
     :class:`~kornia_pnpnet.result.PnPResult`. Solvers of this package take more arguments, see
-    :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. For a type checker, the result is a ``PnPNet`` unless
-    ``name`` is a literal name of a solver of another library.
+    :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`. Type checkers infer a ``PnPNet`` unless
+    ``name`` is the literal name of another library's solver.
 
     Args:
         name: one of :func:`list_solvers`.
@@ -165,8 +165,8 @@ def solve_pnp(
 
     Returns:
         Matrices :math:`[R\,|\,t]` with ``x_cam = R x_world + t``, shape :math:`(B, 3, 4)`. The dtype is float64 if any
-        input is float64, else float32. Gradients flow to points, pixels, intrinsics and weights. The matrix of a
-        problem whose ``ok`` is false is NaN without gradient.
+        input is float64, else float32. Gradients flow to points, pixels, intrinsics and weights. If a problem
+        is not ``ok``, its matrix is NaN and has no gradient.
 
     Raises:
         ValueCheckError: for an unknown name.

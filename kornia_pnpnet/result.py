@@ -1,4 +1,4 @@
-"""Poses, results and problems with known poses: the tensors that the public functions take and return.
+"""Tensors that the public functions take and return: poses, results, and problems with known poses.
 
 Each class of tensors is a ``NamedTuple`` and therefore a pytree, which ``torch.compile``, ``torch.export``,
 ``torch.func`` and data loaders accept. In all shapes of the package, ``B`` is the number of problems in the batch, and
@@ -89,7 +89,7 @@ class Pose(NamedTuple):
 
     @classmethod
     def from_quaternion(cls, quaternion: Tensor, translation: Tensor) -> Pose:
-        r"""A pose from a quaternion :math:`(w, x, y, z)`, the order of COLMAP and Kornia.
+        r"""A pose from a quaternion in the order :math:`(w, x, y, z)` of COLMAP and Kornia, and a translation.
 
         Args:
             quaternion: quaternion of any length except 0, shape :math:`(B, 4)`.
@@ -121,14 +121,13 @@ class Pose(NamedTuple):
 
     @property
     def se3(self) -> Se3:
-        """The pose as Kornia's ``Se3``, with gradients. Kornia's tangent vectors are (translation, rotation)."""
+        """The pose as Kornia's ``Se3``, with gradients. Kornia orders tangent vectors (translation, rotation)."""
         return Se3.from_matrix(self.matrix)
 
     def camera(self, intrinsics: Tensor | PinholeCamera, height: int = 1, width: int = 1) -> PinholeCamera:
         r"""Kornia's camera with the pose as its extrinsics.
 
-        Kornia's cameras have one batch dimension. A single pose becomes a batch of one, and other leading dimensions
-        are merged.
+        Kornia's cameras have one batch dimension. A single pose becomes a batch of one. Leading dimensions are merged.
 
         Args:
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`; or Kornia's camera, whose image size
@@ -188,7 +187,7 @@ def check_poses(estimate: Pose, truth: Pose) -> None:
 
 @full_precision
 def with_rotation(pose: Pose) -> Pose:
-    """Replace each matrix, ``(*, 3, 3)``, by the nearest rotation, or by NaN if its determinant is not positive."""
+    """Replace matrices ``(*, 3, 3)`` by the nearest rotations, and matrices of non-positive determinant by NaN."""
     matrices = pose.rotation.reshape(-1, 3, 3)
     rotation, unique = nearest_rotation(matrices.permute(1, 2, 0))
     usable = unique & (torch.linalg.det(matrices.detach()) > 0)
@@ -197,7 +196,7 @@ def with_rotation(pose: Pose) -> Pose:
 
 
 def sound_pose(pose: Pose, sound: Tensor) -> Pose:
-    """Replace the poses (*) that are not ``sound``, bool (*), by the identity, without gradient."""
+    """Replace the poses (*) that are not ``sound``, bool (*), by the identity, which has no gradient."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     rotation = torch.where(sound[..., None, None], pose.rotation, eye)
     return Pose(rotation, torch.where(sound[..., None], pose.translation, 0.0))
@@ -233,7 +232,7 @@ class PosePrior(NamedTuple):
 
 @unique
 class Status(IntEnum):
-    """The values of ``PnPResult.status``: why a problem is not ``ok``."""
+    """The values of ``PnPResult.status``. Each value except ``SOLVED`` is a reason why a problem is not ``ok``."""
 
     #: The problem is ``ok``.
     SOLVED = 0
@@ -254,12 +253,12 @@ class Status(IntEnum):
     #: Fewer than 3 pairs are in front of the camera at the best pose.
     BEHIND = 6
     #: The dtype has too few digits for the points: the coordinates are large, and their differences are small. Use
-    #: float64, or subtract an offset from the points before they become float32.
+    #: float64, or subtract an offset from the points before the conversion to float32.
     PRECISION = 7
     #: Pairs were left out because their ``confidence`` is not in [0, 1], and the other pairs determine no pose.
     CONFIDENCE = 8
-    #: The pose ``init`` was ignored, and no other pose was found. An ignored ``init`` is not finite, or the determinant
-    #: of its matrix is not positive.
+    #: The pose ``init`` was ignored, and no other pose was found. ``init`` is ignored if it is not finite, or if the
+    #: determinant of its matrix is not positive.
     INIT = 9
 
 
@@ -270,7 +269,7 @@ class Alternatives(NamedTuple):
         rotation: world-to-camera rotations by descending probability, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
         cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. Costs of one problem are comparable.
-        probability: probability of each pose, given that the true pose is among the alternatives and the result's pose,
+        probability: probability of each pose, given that the true pose is the result's pose or an alternative,
             shape :math:`(B, S)`.
         valid: which slots hold a pose, bool, shape :math:`(B, S)`. Empty slots come last.
     """
@@ -302,8 +301,8 @@ class PnPResult(NamedTuple):
         weights: final weight of each pair, in the caller's order, shape :math:`(B, N)`.
         cost: robust loss of the pairs and of a prior, divided by the number of pairs, in the unit of the kernel (see
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
-        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the fields above,
-            ``intrinsics`` and ``dist`` are finite, but have a gradient only with ``gradient="always"``.
+        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, ``intrinsics``,
+            ``dist`` and the fields above are finite, but have a gradient only with ``gradient="always"``.
         init: the first guess. The first guess of every valid problem has a gradient, even if the refinement failed, so
             that an initialiser can learn from failures.
         status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
@@ -312,11 +311,12 @@ class PnPResult(NamedTuple):
             libraries return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; empty unless the call requested alternatives.
         intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`. In a rig the shape may be
-            :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. For one camera, the identity
+            :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. Without a rig, the identity
             replaces an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
         sigma: standard deviation of a pixel coordinate in the caller's pixels, estimated from the inliers, shape
-            :math:`(B,)`, without gradient. The noise of points is included, in pixels at the geometric mean depth.
+            :math:`(B,)`, without gradient. The noise of points is included. If the standard deviation differs between
+            pairs, ``sigma`` is the geometric mean over all pairs that are not padding.
         inliers: which pairs are inliers of the pose, bool, shape :math:`(B, N)`.
     """
 
@@ -373,7 +373,7 @@ class PnPResult(NamedTuple):
     def covariance(
         self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, **noise: Any
     ) -> Tensor:
-        """The covariance of the pose, a shortcut for :func:`~kornia_pnpnet.covariance.pose_covariance`.
+        """The covariance of the pose, computed by :func:`~kornia_pnpnet.covariance.pose_covariance`.
 
         Args:
             world_points: the points of the solver's call.
@@ -411,13 +411,13 @@ class Problems(NamedTuple):
         world_points: shape :math:`(B, N, 3)`.
         img_points: pixels, shape :math:`(B, N, 2)`.
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
-        pose: the true world-to-camera pose, in a rig the pose of the rig.
+        pose: the true world-to-camera pose; for a rig, the pose of the rig.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate. ``None``, here and below: unknown.
+        img_sigma: standard deviation of the noise on each pixel coordinate. ``None`` means unknown, also below.
         world_sigma: standard deviation of the noise on each world coordinate.
         confidence: belief that a pair is an inlier.
-        img_cov: covariance of the noise of each pixel, in place of ``img_sigma``.
-        world_cov: covariance of the noise of each world point, in place of ``world_sigma``.
+        img_cov: covariance of each pixel's noise, in place of ``img_sigma``.
+        world_cov: covariance of each world point's noise, in place of ``world_sigma``.
         cam_from_rig: the transform from a rig to the camera of each pair; ``None``: one camera.
     """
 

@@ -43,7 +43,7 @@ __all__ = ["PnPNet"]
 _LONGEST_GRADIENT = 10.0
 # Number of additional iterations of the refinement if the focal length starts from a nominal value (see `_with_camera`)
 # or distortion is estimated. With 1000 pairs, fewer iterations do not converge (CameraProblems, seeds 4321 and 4322).
-# Only these iterations give the distortion a gradient.
+# With `m = 0`, only these iterations give the distortion a gradient.
 _MORE_ITERATIONS = 4
 
 
@@ -74,8 +74,8 @@ class PnPNet(PretrainedMixin):
     :class:`~kornia_pnpnet.result.Status`), and a finite pose without gradient.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + s y/z + cx`` with the skew ``s``. All
-    multiples of a camera matrix are the same camera. Focal lengths may be negative, for example ``fy`` if the v axis of
-    the image points up.
+    multiples of a camera matrix describe the same camera. Focal lengths may be negative, for example ``fy`` if the v
+    axis of the image points up.
 
     Precision: the layer computes in float64 if any input tensor is float64, else in float32. Results have the dtype of
     the computation. Integer inputs are converted. Inputs in float16 or bfloat16 are also converted, because half
@@ -193,7 +193,7 @@ class PnPNet(PretrainedMixin):
                 extrinsics are ignored. In a rig, each pair may have its own matrix, shape :math:`(B, N, 3, 3)`. With
                 bearings, intrinsics may be ``None``. Sigmas and thresholds are then in radians. If intrinsics are given
                 with bearings, sigmas and thresholds are in pixels at the given focal length.
-            weights: weight of each pair for u and v, at least 0, shape :math:`(B, N)`. ``None``: all weights are 1.
+            weights: weight of each pair, for both u and v, at least 0, shape :math:`(B, N)`; ``None``: 1.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
                 of the initialiser. Without an initialiser the refinement starts from ``init`` alone. A matrix of
@@ -202,15 +202,15 @@ class PnPNet(PretrainedMixin):
             img_sigma: standard deviation of the noise on each pixel coordinate, at least 0: a number, or a tensor of
                 shape :math:`(B,)` or :math:`(B, N)` with NaN where unknown. With ``img_sigma`` or ``world_sigma``,
                 residuals and the scales of the refinement's kernel are in standard deviations.
-            world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``. The
-                shapes and the meaning of NaN are those of ``img_sigma``.
-            img_cov: covariance of the noise of each pixel in px², symmetric and positive semi-definite, shape
+            world_sigma: standard deviation of the noise on each world coordinate, in the unit of ``world_points``. For
+                shapes and NaN see ``img_sigma``.
+            img_cov: covariance, in px², of each pixel's noise, symmetric and positive semi-definite, shape
                 :math:`(B, N, 2, 2)`. Give ``img_cov`` or ``img_sigma``, not both.
-            world_cov: covariance of the noise of each world point, shape :math:`(B, N, 3, 3)`. Give ``world_cov`` or
+            world_cov: covariance of each world point's noise, shape :math:`(B, N, 3, 3)`. Give ``world_cov`` or
                 ``world_sigma``, not both.
             confidence: the caller's belief, in [0, 1], that a pair is an inlier, for example a matcher's score, shape
-                :math:`(B, N)`; NaN where unknown. Values up to 0.001 below 0 or above 1 are rounded to 0 or 1. A pair
-                with any other value outside [0, 1] is left out. Pairs of high confidence are drawn more often for
+                :math:`(B, N)`; NaN where unknown. Values that leave [0, 1] by less than 0.001 are clipped. A pair with
+                any other value outside [0, 1] is left out. Pairs of high confidence are drawn more often for
                 minimal samples. Networks that were trained with confidences take confidences as an input. Confidences
                 need not be calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior adds a
@@ -224,7 +224,7 @@ class PnPNet(PretrainedMixin):
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out. To keep such pixels, pass bearings.
             cam_from_rig: the transform from the frame of a rig (several cameras) to the frame of each pair's camera,
                 :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The solved pose is then the pose of the rig.
-            first_stage_only: return the first guess unrefined (the paper's "Net"), like a refiner with ``m=0``.
+            first_stage_only: return the first guess without refinement (the paper's "Net"), as solvers with ``m=0`` do.
             gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`. ``None``: the solver's own option.
             alternatives: largest number of alternative poses to return, see
                 :class:`~kornia_pnpnet.result.Alternatives`. The search takes as long as several calls without
@@ -310,13 +310,13 @@ class PnPNet(PretrainedMixin):
         """Compile the first stage, one iteration and the final stage of the solver in place, with ``torch.compile``.
 
         The first call compiles for some seconds. A new number of pairs, a new dtype, or the first call with gradients
-        causes a new compilation. A new batch size causes none. Parts that cannot be compiled run uncompiled after one
-        warning: RANSAC always, and all parts if there is no C++ compiler or PyTorch is older than 2.13. A copy of the
-        solver compiles again.
+        causes a new compilation. A new batch size causes none. RANSAC is never compiled. Parts that cannot be compiled
+        run uncompiled after one warning. If there is no C++ compiler, or if PyTorch is older than 2.13, all parts run
+        uncompiled. A copy of the solver compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
-            whole: compile the solver with all iterations as one graph of fixed effort. The first call takes longer.
+            whole: compile the whole solver as one graph. The effort is then fixed. The first call takes longer.
                 Calls with few problems then take half the time, because less Python code runs.
         """
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)

@@ -90,7 +90,7 @@ def test_priors_are_those_of_the_training_configuration(source):
 def test_known_noise_is_added_to_the_same_problems():
     ((name, known),) = draw("synthetic", outliers="2", count=300, known_noise=True).items()
     ((plain_name, plain),) = draw("synthetic", outliers="2", count=300).items()
-    assert name == f"{plain_name}, noise told"
+    assert name == f"{plain_name}, noise given"
     assert plain.problems.sigmas == {}
     assert torch.equal(known.problems.img_points, plain.problems.img_points)
     assert known.problems.img_sigma.tolist() == [1.0] * 300

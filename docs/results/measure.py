@@ -33,7 +33,7 @@ OUTPUTS = HERE.parents[1] / "outputs" / "results"
 #: The results files of evaluations, by name without ``.json``.
 RESULTS = (
     *("paper", "gaussian_pose", "real", "mismatches", "crowd", "against_n", "against_m", "views", "distribution"),
-    *("set", "set_told", "set_real", "set_real_told"),
+    *("set", "set_given", "set_real", "set_real_given"),
 )
 #: Other files that ``make.py measure`` writes.
 OTHERS = ("honesty", "probability", "judge", "complexity")
@@ -214,9 +214,9 @@ def measure_set(counts: Counts, wanted: set[str]) -> None:
     if "set_real" in wanted:
         few = (ANY, OURS, "p3p-ransac", "opencv-ransac", "poselib", "known-inliers")
         run("set_real", named(few, tuned["real"]), real, tuned=tuned["real"])
-    if "set_real_told" in wanted:
+    if "set_real_given" in wanted:
         sigma = tune_sigma(counts.tuning_scenes())
-        run("set_real_told", named((ANY,)), with_known_noise(real, sigma), img_sigma=sigma)
+        run("set_real_given", named((ANY,)), with_known_noise(real, sigma), img_sigma=sigma)
 
 
 def tune_sigma(data: Mapping[str, EvaluationData]) -> float:
@@ -237,15 +237,15 @@ def with_known_noise(sets: Mapping[str, EvaluationData], img_sigma: float) -> di
         sigma = torch.full_like(entry.problems.world_points[:, 0, 0], img_sigma)
         problems = entry.problems._replace(img_sigma=sigma, world_sigma=torch.zeros_like(sigma))
         description = {**entry.description, "img_sigma": img_sigma, "world_sigma": 0.0}
-        found[f"{name}, noise told"] = entry._replace(problems=problems, description=description)
+        found[f"{name}, noise given"] = entry._replace(problems=problems, description=description)
     return found
 
 
-def measure_set_told(counts: Counts, _: set[str]) -> None:
+def measure_set_given(counts: Counts, _: set[str]) -> None:
     """The network for any number of pairs with known noise."""
     options: dict[str, Any] = {"count": 2 * counts.synthetic, "seed": SEED_REPORT + 20, "known_noise": True}
     sets = counts.draw(["synthetic", "any_rotation"], "none,uniform,3", **options)
-    run("set_told", named((ANY, "known-inliers-and-noise")), sets)
+    run("set_given", named((ANY, "known-inliers-and-noise")), sets)
 
 
 @torch.no_grad()
@@ -307,8 +307,8 @@ STEPS: tuple[tuple[set[str], Callable[[Counts, set[str]], None]], ...] = (
     ({"real", "mismatches"}, measure_scenes),
     ({"against_m"}, measure_depths),
     ({"views"}, measure_views),
-    ({"set", "set_real", "set_real_told"}, measure_set),
-    ({"set_told"}, measure_set_told),
+    ({"set", "set_real", "set_real_given"}, measure_set),
+    ({"set_given"}, measure_set_given),
     ({"honesty"}, measure_honesty),
 )
 

@@ -31,7 +31,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line with the arguments ``argv``, or with the arguments of the process.
+    """Run the command line with the arguments ``argv``. ``None`` means the arguments of the process.
 
     Returns:
         The exit code: 0 for success, 1 when ``solve`` found no pose, 2 for bad input, 130 after an interruption.

@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def verdict(results: Mapping[str, Any]) -> str:
-    """Name, for each set, the solvers that solved the most problems, and the fastest solver.
+    """For each set, name the solvers that solved the most problems, and the fastest solver.
 
     Solvers whose 95 % interval contains the highest success rate share the first place.
     """
@@ -73,7 +73,7 @@ def _result(row: Mapping[str, Any]) -> str:
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Draw the first of the problems with the most outliers. The choice does not depend on the solver."""
+    """Among the problems with the most outliers, draw the first. The choice does not depend on the solver."""
     import torch
 
     from kornia_pnpnet.cameras import reproject
@@ -89,7 +89,7 @@ def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -
 
 
 def _train(seconds: float, folder: Path) -> Path | None:
-    """Train and print the success rates of the first and last validation. Return ``None`` if a package is missing."""
+    """Train, and print the success rates of the first and last validation. Return ``None`` if a package is missing."""
     from kornia_pnpnet.core.extras import needs
     from kornia_pnpnet.core.files import read_csv
 

@@ -29,7 +29,7 @@ _WHAT = {
 
 
 def run(_: argparse.Namespace) -> int:
-    """Print the description of each solver, and the missing package if the solver needs one."""
+    """Print the description of each solver. If the solver needs a package that is missing, name the package."""
     from kornia_pnpnet import list_solvers, shipped_weights
     from kornia_pnpnet.core.extras import how_to_install
     from kornia_pnpnet.evaluation.named_solvers import BOUNDS, missing_package

@@ -26,7 +26,7 @@ SUFFIXES = (".npz", ".parquet")
 
 # Key in the metadata of a results file. The value holds the solver's name and the digest of the solver's parameters.
 _SOLVER = b"kornia_pnpnet.solver"
-# Largest number of values that are read from a Parquet file at once: 256 MB in float64.
+# Largest number of values that are read from a Parquet file at once: 256 MiB in float64.
 _NUMBERS_AT_ONCE = 2**25
 
 
@@ -37,7 +37,7 @@ class ShardReport(NamedTuple):
     problems: int  #: Number of all problems in the shards of this call.
     shards: int  #: Number of shards that this call solved.
     kept: int  #: Number of shards that were skipped because they have results.
-    failed: list[str]  #: One error message for each shard that cannot be read.
+    failed: list[str]  #: One error message for each shard that cannot be read or solved.
 
 
 def solve_shards(
@@ -61,7 +61,7 @@ def solve_shards(
 
     Args:
         solve: the solver.
-        sources: shards, or folders of shards. The report names the shards that cannot be read.
+        sources: shards, or folders of shards. The report names the shards that cannot be read or solved.
         out: folder of the results. None of the shards may be in this folder.
         name: name of the solver. Results files store this name and the digest of the solver's parameters.
         batch: largest number of problems that are read and solved at once.
@@ -131,7 +131,7 @@ def _bar(shards: Iterable[Path], shown: bool) -> Any:
     total = None  # the total is unknown with NPZ files and with files that cannot be read
     with suppress(OSError, pa.ArrowException):
         total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
-    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # None: no bar without a terminal
+    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # no bar without a terminal
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
@@ -157,7 +157,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
 def _tables_of_parquet(shard: Path, batch: int) -> Iterator[pa.Table]:
     """Yield tables of at most ``batch`` rows from a Parquet file. An empty file yields one empty table."""
     try:
-        # With pre_buffer, Arrow would read the whole file ahead; without buffer_size, it would read whole row groups.
+        # With pre_buffer, Arrow reads the whole file ahead. Without buffer_size, Arrow reads whole row groups.
         with parquet.ParquetFile(shard, pre_buffer=False, buffer_size=1 << 20) as file:
             groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
             numbers = [sum(x.column(i).num_values for i in range(x.num_columns)) // max(x.num_rows, 1) for x in groups]

@@ -1,7 +1,7 @@
 """Find the pose of one image, or of many problems in files.
 
 The pose of one image, x_cam = R x_world + t, is printed as a table on a terminal, and as JSON into a pipe or with
---json. Standard deviations follow from the inliers' residuals. A rotation's deviations are about the camera's axes.
+--json. The inliers' residuals give the standard deviations. The rotation has one about each axis of the camera.
 
   pnpnet solve matches.csv --intrinsics 3400,3400,3024,2016 --plot pose.png
 
@@ -42,7 +42,7 @@ _ADVICE = {
     "offset before they become float32",
     "behind": "the points are behind the camera; check the axes: x to the right, y down, z forward",
 }
-# Largest plausible noise, and smallest plausible share of inliers. A file with a wrong convention violates a limit.
+# Largest plausible noise, and smallest plausible share of inliers. A file in another convention violates a limit.
 _MOST_NOISE_PX, _LEAST_SHARE = 10.0, 0.5
 _MISTAKES = (
     "swapped columns, another image size, y up? try --diagnose; many outliers? try --solver p3p-ransac:threshold=PX"

@@ -1,1 +1,1 @@
-"""Internal foundations of the package, not public: checks, linear algebra, compilation, files, schemas."""
+"""Internal modules (not public): checks, linear algebra, compilation, files, schemas."""

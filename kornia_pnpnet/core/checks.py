@@ -53,14 +53,14 @@ def check_ranges(**values: Any) -> None:
 
 
 def check_tensors(tensors: Mapping[str, Any]) -> None:
-    """Raise ``TypeCheckError`` when a value is not a tensor. Entries of ``None`` are skipped."""
+    """Raise ``TypeCheckError`` when a value is not a tensor. ``None`` is skipped."""
     for name, value in tensors.items():
         if value is not None and not isinstance(value, Tensor):
             raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
 
 
 def check_form(form: list[str], **tensors: Tensor) -> None:
-    """Raise an error unless each value is a tensor of the shape ``form``, in the notation of ``KORNIA_CHECK_SHAPE``."""
+    """Raise an error unless each value is a tensor of the shape ``form`` (notation of ``KORNIA_CHECK_SHAPE``)."""
     check_tensors(tensors)
     for name, tensor in tensors.items():
         KORNIA_CHECK_SHAPE(tensor, form, f"Argument: {name}")
@@ -78,7 +78,7 @@ def check_shapes(shapes: Shapes, like: Tensor | None = None) -> None:
 
 
 def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise an error when a tensor has another dtype or device than ``like``. Entries of ``None`` are skipped."""
+    """Raise an error when a tensor has another dtype or device than ``like``. ``None`` is skipped."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.dtype != like.dtype:
             raise TypeCheckError(f"{name} is {tensor.dtype} but {like_name} is {like.dtype}.")
@@ -86,7 +86,7 @@ def check_like(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: st
 
 
 def check_devices(tensors: Mapping[str, Tensor | None], like: Tensor, like_name: str = "world_points") -> None:
-    """Raise ``DeviceError`` when a tensor is on another device than ``like``. Entries of ``None`` are skipped."""
+    """Raise ``DeviceError`` when a tensor is on another device than ``like``. ``None`` is skipped."""
     for name, tensor in tensors.items():
         if tensor is not None and tensor.device != like.device:
             raise DeviceError(f"{name} is on {tensor.device} but {like_name} is on {like.device}.")

@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
-#: Number of times that the poses, ``ok`` or ``probability`` of solvers changed. Raise the number with each such change,
-#: so that a test can find results files that are too old. Files without a number were measured before the first change.
+#: Number of code changes that altered the poses, ``ok`` or ``probability`` of a solver. Raise the number with each such
+#: change: a test then finds old results files. Files without a number were measured before the first change.
 BEHAVIOUR = 5
 
-# Git paths that decide measured results. Other files, such as written results, do not count as changes of a checkout.
+# Git paths that affect measured results. A checkout counts as changed only if files at these paths changed.
 _MEASURED = ("*.py", "kornia_pnpnet", "conf")
 _PACKAGES = ("kornia_pnpnet", "torch", "kornia", "numpy", "opencv", "kornia_rs", "poselib", "pycolmap")
 # Distributions of OpenCV on PyPI, the most common distribution first.
@@ -30,7 +30,7 @@ def environment() -> dict[str, Any]:
     Returns:
         ``versions`` by package (``None`` if not installed), ``python``, ``platform``, ``cpu``, ``threads`` of PyTorch,
         ``gpu`` (``None`` without a GPU), ``date`` in UTC, ``behaviour`` (``BEHAVIOUR``), and the git ``commit`` of the
-        package (``None`` outside a checkout), with a final ``+`` if Python files, weights or configurations changed.
+        package (``None`` outside a checkout). A final ``+`` means changed Python files, weights or configurations.
     """
     return {
         "versions": {name: _version(name) for name in _PACKAGES},

@@ -7,13 +7,13 @@ from contextlib import contextmanager
 
 
 def how_to_install(extra: str) -> str:
-    """Return the command that installs an extra from a clone, because no package index has this library yet."""
+    """Return the command that installs an extra from a clone. No package index has this library yet."""
     return f"in a clone of kornia_pnpnet, pip install '.[{extra}]'"
 
 
 @contextmanager
 def needs(extra: str, message: str) -> Iterator[None]:
-    """Import packages of an extra in this context. An ``ImportError`` then names the command that installs the extra.
+    """A context for imports of an extra's packages. An ``ImportError`` names the command that installs the extra.
 
     Example:
         >>> with needs("eval", "Pictures need matplotlib"):

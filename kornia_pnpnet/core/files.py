@@ -54,7 +54,7 @@ def write_json(path: str | Path, content: Any) -> None:
 
 
 def read_csv(path: str | Path, columns: Sequence[str], optional: Sequence[str] = ()) -> dict[int, dict[str, str]]:
-    """Read a CSV file with a header, and map the line number of each row to its cells by column name.
+    """Read a CSV file with a header. The result maps line numbers to rows, and a row maps column names to cells.
 
     Blank lines and spaces around cells are dropped. All columns are kept. Raise ``InputError`` when the file is not
     CSV in UTF-8, one of ``columns`` is missing, one of ``columns`` or ``optional`` occurs twice, or a row has more or

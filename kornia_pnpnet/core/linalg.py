@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices by elementwise operations, with the batch usually last.
+"""Linear algebra of small matrices by elementwise operations. The batch is usually the last dimension.
 
 For 1000 3×3 matrices, an operation on one entry of each matrix takes about 1 µs, and a call of LAPACK takes about 1 ms.
 """
@@ -16,7 +16,7 @@ from torch.autograd.forward_ad import unpack_dual
 
 from kornia_pnpnet.core.performance import are_few, compiling
 
-# Number of Jacobi sweeps. For random matrices, the median error of an eigenvalue is then below 1e-9 times the norm.
+# Number of Jacobi sweeps. Two sweeps of random matrices give a median error of eigenvalues below 1e-9 times the norm.
 _SWEEPS = 2
 # Smallest pivot, in units in the last place of the diagonal entry. A smaller pivot is treated as a rounding error.
 _PIVOT = 10.0
@@ -53,13 +53,13 @@ class _BoundedGradient(torch.autograd.Function):
 
 
 def bound_gradient(values: Tensor, limit: float) -> Tensor:
-    """Return values (B, *) unchanged. Limit the norm of each problem's gradient, and set non-finite gradients to 0."""
+    """Return ``values`` (B, *) unchanged. Limit each problem's gradient in norm, and set non-finite gradients to 0."""
     bounded: Tensor = _BoundedGradient.apply(values, limit)  # type: ignore[no-untyped-call]
     return bounded
 
 
 def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> Tensor:
-    """Keep values (B, *) of problems that are ``finite`` (B,), and gradients of problems that are ``live`` (B,).
+    """Keep values (B, *) where ``finite`` (B,) is true, and gradients where ``live`` (B,) is true.
 
     Problems that are not finite get the value ``fill``, a number or a tensor with the shape of one problem.
     """
@@ -138,7 +138,7 @@ def _rotation_in_closed_form(matrix: Tensor) -> tuple[Tensor, Tensor]:
     largest = (mean + 2.0 * radius * (cosine.clamp(-1.0, 1.0).acos() / 3.0).cos()).sqrt()
     # The stack makes a compiler compute both values once per matrix, not once per entry.
     largest, determinant = torch.stack((largest, determinant))
-    # `upright` is M + C / s₁ with the cofactors C of M; for s₁ see `nearest_rotation`. M and `upright` have the same
+    # `upright` is M + C / s₁, where C holds the cofactors of M (s₁: see `nearest_rotation`). M and `upright` have equal
     # singular vectors. The singular values of `upright` are first = s₁ + s₂s₃/s₁ (once) and second = s₂ + s₃ (twice).
     # G = `upright`ᵀ `upright` has two distinct eigenvalues, so that G^(-1/2) = `constant` I + `linear` G.
     upright = scaled + cofactors / largest
@@ -192,7 +192,7 @@ class _NearestRotation(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        # The linear map from dM to dR is symmetric, so that it also maps the gradient for R to the gradient for M.
+        # The linear map from dM to dR is symmetric. The same map takes the gradient for R to the gradient for M.
         return _turned(gradients[0], *ctx.saved_tensors)
 
 
@@ -238,7 +238,7 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def span_a_plane(centred: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-    """Tell whether points span more than a line, and whether by more than rounding errors, bool (B,) each.
+    """Tell whether points span a plane, and whether their distances from a line exceed rounding errors, bool (B,) each.
 
     ``centred`` holds points (3, N, B) minus their mean. Coordinates before centring are at most 1, and padding is 0.
     ``share`` (B,) is the inverse of the number of points.
@@ -255,7 +255,7 @@ def span_a_plane(centred: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
 def solve_leading(
     matrix: Iterable[Sequence[Tensor]], rhs: Iterable[Tensor], sizes: Sequence[int]
 ) -> list[list[Tensor]]:
-    """Solve systems for several leading blocks of positive semi-definite matrices by one factorisation L D Lᵀ.
+    """Solve systems for several leading blocks of a positive semi-definite matrix by one factorisation L D Lᵀ.
 
     ``sizes`` has the sizes of the blocks. Entries of ``matrix`` above the diagonal are not read. Each pivot is raised
     slightly, so that the solution of a singular system is finite if ``rhs`` lies in the range of the matrix.
@@ -276,8 +276,8 @@ def factorise(
 ) -> tuple[dict[tuple[int, int], Tensor], list[Tensor]]:
     """Factorise symmetric matrices as L D Lᵀ, entry by entry, and solve L D y = b.
 
-    The rows of the lower triangle and the entries ``rest`` of b are overwritten. ``inverse`` maps the index and the
-    value of a pivot, which may be 0, to a finite inverse. Returns the entries of L below its unit diagonal, keyed by
+    ``rows`` (the lower triangle) and ``rest`` (the entries of b) are overwritten. ``inverse(index, pivot)`` must return
+    a finite inverse of a pivot, even if the pivot is 0. Returns the entries of L below its unit diagonal, keyed by
     (row, column), and the entries of y.
     """
     count = len(rest)
@@ -331,8 +331,8 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
     factor, info = torch.linalg.cholesky_ex(batched.detach())
     pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
     solved = (pivots > least).all(1) & (info == 0)  # NaN compares false
-    # Gradients of a failed factorisation are NaN. If gradients are needed, the matrices are factorised again, with the
-    # identity in place of each matrix whose factorisation failed.
+    # Gradients of a failed factorisation are NaN. If gradients are needed, the matrices are factorised again. The
+    # identity replaces each matrix whose factorisation failed.
     if batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
         factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
     solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT

@@ -31,7 +31,7 @@ exporting = torch.compiler.is_exporting
 
 
 def sees_values(x: Tensor) -> bool:
-    """Whether Python can read the values: not in tracing, not under ``torch.func.vmap``, not on the device ``meta``."""
+    """Whether Python can read the values. Tracing, ``torch.func.vmap`` and the device ``meta`` prevent reading."""
     if compiling():
         return False
     functorch = torch._C._functorch
@@ -57,7 +57,7 @@ def full_precision(function: Callable[_P, _T]) -> Callable[_P, _T]:
 def _within(
     context: Callable[[Tensor | None], AbstractContextManager[Any]], function: Callable[_P, _T]
 ) -> Callable[_P, _T]:
-    """Call a function in the context that fits the first tensor among its arguments, or ``None``."""
+    """Call a function in ``context(x)``, where x is the first tensor among its arguments (``None``: no tensor)."""
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
@@ -83,7 +83,7 @@ if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even i
 
 
 def in_turn(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Let threads call a function one after the other, if the first tensor is small (see :func:`are_few`).
+    """Let threads call a function one after the other if its first tensor is small (see :func:`are_few`).
 
     Without turns, four threads wait for Python's lock at each operation, and take 2.5 times as long as one thread.
     """
@@ -96,7 +96,7 @@ _FEW_NUMBERS = 4096
 
 
 def are_few(x: Tensor) -> bool:
-    """Whether the code is uncompiled and the tensor is small and on a CPU. LAPACK then replaces loops over entries."""
+    """Whether the code is uncompiled and the tensor is small and on a CPU. If so, LAPACK replaces entrywise loops."""
     return not compiling() and x.device.type == "cpu" and x.numel() <= _FEW_NUMBERS
 
 
@@ -106,8 +106,8 @@ def are_few(x: Tensor) -> bool:
 def problems_last(tree: _T) -> _T:
     """Lay out tensors (B, N, C), except small ones, as (C, N, B) in memory. Shapes and values do not change.
 
-    Elementwise operations then fill the vector registers of the CPU. With 9 pairs per problem, this layout halves the
-    time of an iteration of the refinement.
+    This layout lets elementwise operations fill the vector registers of the CPU. With 9 pairs per problem, the layout
+    halves the time of an iteration of the refinement.
     """
     return map_tensors(lambda x: x if x.ndim < 2 or are_few(x) else _last(x), tree)
 
@@ -133,7 +133,7 @@ def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
 
-# Largest mmap threshold of glibc, 32 MiB (mallopt(3), M_MMAP_THRESHOLD), minus a margin for the allocation's header.
+# Largest mmap threshold of glibc (32 MiB, see M_MMAP_THRESHOLD in mallopt(3)) minus room for an allocation's header.
 _LARGEST_KEPT = 2**25 - 2**16
 
 
@@ -196,23 +196,23 @@ def present_first(present: Tensor) -> Tensor:
 
 
 def ascending_order(keys: Tensor) -> Tensor:
-    """Find the positions (B, N) of the stable ascending order by two keys (2, N, B) without NaN."""
+    """Find the positions (B, N) that sort pairs stably by two ascending keys (2, N, B) without NaN."""
     if not exporting() and _are_few_pairs(keys):
         return _order_by_counting(*keys).mT
-    first, second = keys.mT.contiguous()  # sorting the last dimension takes half the time
+    first, second = keys.mT.contiguous()  # sorting another dimension takes twice the time
     by_second = _ascending(second)
     return by_second.gather(1, _ascending(first.gather(1, by_second)))
 
 
 def _ascending(keys: Tensor) -> Tensor:
-    """The stable ascending order along the last dimension."""
+    """Find the indices that sort the last dimension stably in ascending order."""
     if exporting():  # ONNX has no stable sort, but its top-k is stable
         return keys.topk(keys.shape[-1], largest=False).indices
     return keys.argsort(stable=True, dim=-1)
 
 
 def _order_by_counting(*keys: Tensor) -> Tensor:
-    """Find the stable ascending order by keys (N, *), of which the first has priority."""
+    """Find the indices that sort stably by ascending keys (N, *). The first key has priority."""
     first = keys[0]
     position = torch.arange(first.shape[0], device=first.device).view(-1, *(1,) * (first.ndim - 1))
     before = position < position[:, None]  # entry (i, j): whether entry j precedes entry i
@@ -261,19 +261,19 @@ def take_pairs(values: Tensor, index: Tensor) -> Tensor:
 
 # --- compilation ------------------------------------------------------------------------------------------------------
 
-# Smallest number of pairs at which the CPU compiler of PyTorch 2.13 must not choose the order of loops. With the
-# compiler's order, code may transpose blocks of 16 numbers, and results are incorrect if a problem has more pairs than
-# the batch has problems. For fewer pairs, the compiler chooses, because code otherwise takes up to 50 % longer.
+# With at least this number of pairs, the CPU compiler of PyTorch 2.13 must not choose the order of loops. The chosen
+# order may transpose blocks of 16 numbers. The transposed results are incorrect if N > B for N pairs and B problems.
+# For fewer pairs, the compiler chooses the order, because a fixed order takes up to 50 % longer.
 _MANY_PAIRS = 16
 
 
 class Runner:
-    """Calls functions of batches, either uncompiled or compiled at their first call.
+    """Calls functions of batches. The functions are uncompiled, or are compiled at their first call.
 
     A function takes tensors and nested tuples of tensors. The first dimension of each non-scalar tensor is the batch.
-    The batch size may change without a new compilation, except to or from 1. PyTorch compiles again when the number of
-    pairs or the dtype changes, and when gradients are switched on or off. If the compilation of a function fails, the
-    runner warns once and then calls the function uncompiled. Compilation needs a C++ compiler and PyTorch 2.13.
+    A new batch size needs no new compilation, unless the old or new size is 1. PyTorch compiles again when the number
+    of pairs or the dtype changes, and when gradients are switched on or off. If the compilation of a function fails,
+    the runner warns once and then calls the function uncompiled. Compilation needs a C++ compiler and PyTorch 2.13.
     """
 
     def __init__(self, compiled: bool = False, mode: str | None = None) -> None:
@@ -295,7 +295,7 @@ class Runner:
         """Call a function."""
         if not self.compiled or compiling() or function.__qualname__ in self.failed:
             return function(*args)
-        # Compiled code is for one memory layout, but layouts of uncompiled results depend on the size of the batch.
+        # Compiled code expects one memory layout, but the layout of uncompiled results depends on the batch size.
         args = map_tensors(_last, args)
         tensors = list(iter_tensors(args))
         name, first = function.__qualname__, tensors[0]
@@ -327,17 +327,17 @@ class Runner:
         options = torch._inductor.list_mode_options(self.mode or "default") | {
             "cpp.vec_isa_ok": True,  # skip tests of instruction sets, which take half of the first compilation
             "cpp.enable_loop_tail_vec": False,  # shortens the compilation by a third, but not the calls
-            "inplace_buffers": False,  # in PyTorch 2.13 they make gradients wrong, see test_core_performance.py
+            "inplace_buffers": False,  # `True` gives incorrect gradients in PyTorch 2.13, see test_core_performance.py
             "guard_filter_fn": _needed_guards,
             **({"pick_loop_orders": False} if many else {}),
         }
-        # Each number of pairs and each dtype needs two compilations, with and without gradients. The limit applies to
-        # each function separately.
+        # Each number of pairs and each dtype needs two compilations, with and without gradients. `recompile_limit`
+        # applies to each function separately.
         limits: dict[str, Any] = {"recompile_limit": 64, "isolate_recompiles": True}
         run = torch.compile(function, fullgraph=True, options=options, **limits)
         if not options.get("triton.cudagraphs"):
             return run
-        # The results are copied, because the next replay of the CUDA graph overwrites them.
+        # Return copies of the results: the next replay of the CUDA graph overwrites the originals.
         return lambda *args: map_tensors(torch.clone, run(*args))
 
 
@@ -363,8 +363,8 @@ def per_problem(scalar: Tensor, like: Tensor) -> Tensor:
 def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
     """Make the options of AOTInductor for a number of pairs; ``None`` means any number.
 
-    With ``on_stack``, tensors stay on the stack if the graph calls no operator of PyTorch. Every call in a thread then
-    returns the same tensors, with new values.
+    With ``on_stack``, tensors stay on the stack if the graph calls no operator of PyTorch. In this case, every
+    call in a thread returns the same tensors with new values.
     """
     return {
         "aot_inductor.allow_stack_allocation": on_stack,
@@ -376,8 +376,8 @@ def package_options(pairs: int | None, *, on_stack: bool) -> dict[str, Any]:
 
 # --- packages of one problem: sorts, running sums and products as elementwise operations ------------------------------
 # A compiler fuses elementwise operations, and calls PyTorch for all other operations. AOTInductor keeps the tensors of
-# a graph on the stack if the graph never calls PyTorch. A package of `pnpnet-n9` for one problem then takes 42 instead
-# of 297 µs.
+# a graph on the stack if the graph never calls PyTorch. On the stack, a package of `pnpnet-n9` for one problem takes 42
+# instead of 297 µs.
 
 # Largest size of an inline sort or cumulative sum. For larger sizes, the graph calls PyTorch, because an inline sort
 # compares each number with all others.

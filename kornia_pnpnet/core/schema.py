@@ -34,7 +34,7 @@ Kept = WrapValidator(_keep)
 def read_json(path: str | Path, kind: type[_T], what: str) -> _T:
     """Read a JSON file, and check its content against a type that pydantic supports.
 
-    Invalid content raises ``ValueError``. The message names ``what`` was expected, and the first invalid entry:
+    Invalid content raises ``ValueError``. The message contains ``what`` (the expected content) and the first error:
     "'a.json' is not a results file: rows[0].success.rate is missing".
     """
     try:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kornia_pnpnet.core.linalg import factorise
 
-# Rounding error in units in the last place of the trace. An eigenvalue counts as negative only below minus this error.
+# Rounding error in units in the last place of the trace. Only an eigenvalue below minus this error counts as negative.
 _ROUNDING = 16.0
 # Least eigenvalue in units in the last place of the trace. Smaller eigenvalues are raised to this bound, because the
 # determinant would otherwise be smaller than its rounding error.
@@ -18,7 +18,7 @@ _LEAST = 64.0
 
 
 class Symmetric2(NamedTuple):
-    """Entries of symmetric 2×2 matrices, one matrix for each pair, as tensors of the same shape."""
+    """Symmetric 2×2 matrices, one matrix for each pair. All entries are tensors of the same shape."""
 
     uu: Tensor
     uv: Tensor
@@ -31,7 +31,7 @@ class Symmetric2(NamedTuple):
 
     @property
     def determinant(self) -> Tensor:
-        """The determinant of a positive definite matrix, raised to at least its rounding error."""
+        """The determinant of a positive definite matrix, bounded below by its rounding error."""
         product = self.uu * self.vv
         least = _LEAST * torch.finfo(product.dtype).eps * product.detach()
         return torch.addcmul(product, self.uv, self.uv, value=-1).maximum(least)
@@ -61,7 +61,7 @@ class Symmetric2(NamedTuple):
 
 
 class Symmetric3(NamedTuple):
-    """Entries of symmetric 3×3 matrices, one matrix for each pair, as tensors of the same shape."""
+    """Symmetric 3×3 matrices, one matrix for each pair. All entries are tensors of the same shape."""
 
     xx: Tensor
     xy: Tensor
@@ -76,8 +76,8 @@ class Symmetric3(NamedTuple):
         return cls(*_upper(matrix))
 
     def divided(self, length: Tensor) -> Symmetric3:
-        """Divide a covariance by a squared length, and add more than the rounding errors to its diagonal."""
-        # Entries of 0 give the length no gradient. The gradient would be NaN if the square of the length underflowed.
+        """Divide a covariance by a squared length, and add more than the rounding errors to the diagonal."""
+        # `length` gets no gradient from zero entries: the gradient would be NaN if the square of `length` underflowed.
         lengths = (torch.where(x == 0, length.detach(), length) for x in self)
         xx, xy, xz, yy, yz, zz = (x / unit / unit for x, unit in zip(self, lengths, strict=True))
         more = 2.0 * _ROUNDING * torch.finfo(xx.dtype).eps * (xx + yy + zz).detach()

@@ -10,7 +10,7 @@ def markdown_table(
 ) -> str:
     """Write a Markdown table. With ``pad``, the columns line up in a terminal.
 
-    ``align`` has ``l`` (left) or ``r`` (right) for each column. ``None`` aligns all columns but the first right.
+    ``align`` has ``l`` (left) or ``r`` (right) for each column. ``None`` means ``lrr…``.
 
     Example:
         >>> print(markdown_table(["solver", "µs"], [["epnp", "7"], ["p3p-ransac", "120"]], pad=True))

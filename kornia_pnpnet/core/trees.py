@@ -13,7 +13,7 @@ _T = TypeVar("_T")
 def map_tensors(function: Callable[..., Any], tree: _T, *others: _T) -> _T:
     """Apply a function to every tensor of nested tuples, named tuples and lists. Other values, such as ``None``, stay.
 
-    With ``others``, trees of the same structure, the function receives one tensor from each tree.
+    ``others`` are trees of the same structure. The function receives one tensor from each tree.
     """
     if isinstance(tree, Tensor):
         return function(tree, *others)

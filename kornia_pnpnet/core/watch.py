@@ -20,7 +20,7 @@ class GradientWatch:
         self._solved: list[Tensor] = []
 
     def see(self, ok: Tensor, *inputs: Tensor | None) -> None:
-        """Record ``ok`` of a batch, bool of any shape, if an input requires a gradient."""
+        """Record ``ok`` (bool of any shape) of a batch if an input requires a gradient."""
         learns = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
         # A tensor of `torch.func` must not outlive its transform. Values cannot be read while a CUDA graph is captured.
         readable = sees_values(ok) and not torch._C._functorch.is_functorch_wrapped_tensor(ok)

@@ -22,7 +22,7 @@ _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
 
 
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
-    """Load a scene from a COLMAP model, or from a file of unfiltered 2D-3D matches with the true poses.
+    """Load a scene from a COLMAP model, or from a file with unfiltered 2D-3D matches and true poses.
 
     The model is in the folder ``path`` or in one of its sub-folders ``dslr_calibration_undistorted`` (ETH3D),
     ``sparse/0`` and ``sparse`` (COLMAP). Pixels of distorted cameras are undistorted, see ``undistort``. If an image
@@ -69,12 +69,12 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
     """Undistort pixels of any camera model that ``pycolmap`` knows.
 
     Args:
-        camera: ``MODEL,width,height,params...``, a line of COLMAP's ``cameras.txt`` without the camera's ID.
+        camera: ``MODEL,width,height,params...``, as in COLMAP's ``cameras.txt`` but without the camera's ID.
         img_points: distorted pixels, shape (N, 2).
 
     Returns:
         Two float64 tensors. The first, (3, 3), is the matrix of the pinhole camera with the same focal length and
-        principal point. The second, (N, 2), has the undistorted pixels; they are NaN where the model has no inverse.
+        principal point. The second, (N, 2), has the undistorted pixels, which are NaN where the model has no inverse.
 
     Raises:
         ImportError: if ``pycolmap`` is missing.
@@ -139,7 +139,7 @@ def _colmap_views(folder: Path) -> Iterator[View]:
         intrinsics, pixels = _pinhole(image.camera, distorted)
         world_to_cam = image.cam_from_world().matrix()  # (3, 4)
         depth = points @ world_to_cam[2, :3] + world_to_cam[2, 3]
-        # A pose that is not finite gives NaN depths. Points of NaN depth are kept, so that `View` refuses the pose.
+        # A pose that is not finite gives NaN depths. Points of NaN depth are kept, and `View` refuses the pose.
         seen = np.isfinite(pixels).all(axis=1) & ~(depth <= 0)
         arrays = (points[seen], pixels[seen], intrinsics, world_to_cam[:, :3], world_to_cam[:, 3])
         world, img, camera, rotation, translation = (torch.tensor(x, device="cpu") for x in arrays)

@@ -30,7 +30,7 @@ class MixedProblems:
 
     Args:
         sources: constructors of the sources, called with ``batch_size``, ``seed`` and ``options``. A constructor is
-            :class:`SyntheticProblems` or a :func:`functools.partial` of this class.
+            :class:`SyntheticProblems` or a :func:`functools.partial` of :class:`SyntheticProblems`.
         shares: one positive number per source. The number of problems of a source is proportional to its share.
             ``None`` means equal shares.
         batch_size: number of problems per batch.
@@ -63,13 +63,13 @@ class MixedProblems:
         sizes = _split(batch_size, shares, round)
         parts = zip(sources, sizes, strict=True)
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
-        # Sources are interleaved. Every slice of a batch then has approximately the shares of the whole batch.
+        # Sources are interleaved, so that the shares of every slice are approximately the shares of the whole batch.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__), device="cpu")
 
     def batch(self, index: int) -> Problems:
         """Draw a batch; the first index is 0."""
-        count = len(self.sources)  # sources get different indices, so that they draw different random numbers
+        count = len(self.sources)  # sources get different indices and thus draw different random numbers
         parts = [source.batch(count * index + i) for i, source in enumerate(self.sources)]
         with_covariances = sum(part.img_cov is not None for part in parts)
         KORNIA_CHECK(with_covariances in (0, count), "All sources of a mixture must give covariances, or none of them.")

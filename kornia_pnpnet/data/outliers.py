@@ -16,8 +16,8 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# `near_pixels` in standard deviations of the noise: the default range, and the smallest values of the two ends. The
-# numbers are choices. Noise hardly exceeds 5 standard deviations.
+# Default range of `near_pixels`, and smallest values of its two ends, all in standard deviations of the pixel noise.
+# The numbers are choices. Noise hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
 # `_SLACK` is added to numbers of outliers before rounding down. A ratio of 0.33 then gives floor(n / 3) for n up to 15.
 _SLACK = 0.05
@@ -46,10 +46,10 @@ class OutlierMix:
     Args:
         max_ratio: largest share of outliers. The limit is rounded down: 0.33 allows n // 3 outliers for n up to 15.
         count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
-        min_count: smallest number of outliers, unless the largest number of outliers is smaller.
+        min_count: smallest number of outliers. If the largest number is smaller, the largest number applies.
         min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
-        mismatch_share: probability that an outlier with none of the kinds below is a *mismatch*, with the pixel of
-            another point. Otherwise, the outlier is *sensing*, with a uniform pixel of the image.
+        mismatch_share: probability that an outlier of none of the kinds below is a *mismatch*, which has the pixel of
+            another point. Otherwise, the outlier is a *sensing* outlier, which has a uniform pixel of the image.
         near_share: probability that an outlier is *near*. The pixel of a near outlier is close to its point's pixel.
         near_pixels: range of the distance, in pixels, between the pixel of a near outlier and the pixel of its point.
             Distances are log-uniform. A lower end below 5 standard deviations of the pixel noise is raised to 5, and an
@@ -58,12 +58,12 @@ class OutlierMix:
             agree on one incorrect pose, as in scenes with repeated structure.
         structured_ratio: range of the ratio of structured outliers to inliers. Each problem draws a uniform ratio.
         structured_angle: largest rotation angle in radians. The pixels of structured outliers show a copy of the
-            problem's points that is shifted and rotated by up to this angle.
-        mirrored_share: probability that the copy of a problem's points for structured outliers is also mirrored.
+            problem's points. The copy is shifted, and is rotated by at most this angle.
+        mirrored_share: probability that the shifted and rotated copy of a problem's points is also mirrored.
         crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
             leader. For each problem, the probability that an outlier joins a crowd is drawn uniformly from 0 to 1.
         max_crowds: largest number of crowds. Each problem draws a number of crowds uniformly from 1 to ``max_crowds``.
-        point_crowd_share: probability that the crowds of a problem share a leader's world point instead of a pixel.
+        point_crowd_share: probability that the crowds of a problem share the leaders' world points, not the pixels.
 
     Example:
         >>> OutlierMix().max_count(9), OutlierMix(max_ratio=0.33).max_count(9), OutlierMix(count=2).max_count(9)

@@ -1,4 +1,4 @@
-"""Priors of points in the camera's frame, and errors of points measured by depth cameras.
+"""Priors of points in the camera's frame, and errors of the points that depth cameras measure.
 
 A new prior is a class with the method ``__call__`` of :class:`PointPrior`. An argument of two numbers is a range.
 """
@@ -171,7 +171,7 @@ class FacadePoints(_View):
 
     Args:
         field_of_view: range, in degrees, from which the field of view of the square image is drawn uniformly.
-        window: range of the window's share of the image area, drawn log-uniformly. All points lie in the window.
+        window: range of the window's share of the image area. The share is log-uniform. All points lie in the window.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:
@@ -236,7 +236,7 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Multiples of ``rays``, (..., 3), where rays enter and leave a box. A ray with enter >= leave misses the box."""
+    """Find where rays enter and leave a box, in units of ``rays``, (..., 3). A ray with enter >= leave misses it."""
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)
 

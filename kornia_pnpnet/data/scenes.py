@@ -36,7 +36,7 @@ class View:
         inliers: whether a pair is an inlier, bool, shape :math:`(M,)`.
 
     Raises:
-        ValueError: if a shape is wrong, a value is not finite, or ``rotation`` is not a rotation matrix.
+        ValueError: if a shape is unexpected, a value is not finite, or ``rotation`` is not a rotation matrix.
     """
 
     name: str
@@ -96,8 +96,8 @@ class SceneProblems(RandomProblems):
     r"""Random problems of a scene, endless and reproducible.
 
     Each problem consists of ``n`` random points of a random image and their pixels. ``outliers`` changes the pixels of
-    some pairs. A *mismatch* gets the pixel of a spare point: a further point of the same image that is in no pair. A
-    *sensing* outlier gets a uniform pixel. For real data with outliers, the protocol uses
+    some pairs. A *mismatch* gets the pixel of a spare point. Spare points are points of the same image that are in no
+    pair. A *sensing* outlier gets a uniform pixel. For real data with outliers, the protocol uses
     ``outliers=OutlierMix(count=2)``. Points and poses do not depend on ``outliers``.
 
     As in the paper, a pose :math:`(R^*, t^*)` is drawn from the protocol's distribution. The world is moved so that
@@ -142,7 +142,7 @@ class SceneProblems(RandomProblems):
 
     @property
     def max_translation(self) -> float:
-        """Limit of the translation error of a success: 0.2 m, or 0.5 % of the median depth if the unit is arbitrary."""
+        """Largest translation error of a success: 0.2 m, or 0.5 % of the median depth if the unit is arbitrary."""
         return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
 
     def _draw(self, generator: torch.Generator) -> Problems:
@@ -166,7 +166,7 @@ class SceneProblems(RandomProblems):
 
 
 def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
-    """Draw k different integers from 0 to count - 1 for each of the B ``counts`` by Floyd's algorithm, (B, k)."""
+    """For each of the B ``counts``, draw k different integers from 0 to count - 1 by Floyd's algorithm, (B, k)."""
     draws = unit((len(counts), k), generator)
     chosen = torch.empty((len(counts), k), dtype=torch.int64)
     for i in range(k):
@@ -174,5 +174,5 @@ def _choose(counts: Tensor, k: int, generator: torch.Generator) -> Tensor:
         candidate = (draws[:, i] * (last + 1)).long()
         chosen_before = (chosen[:, :i] == candidate[:, None]).any(1)
         chosen[:, i] = torch.where(chosen_before, last, candidate)
-    # The algorithm draws a uniformly random set, but the order of the integers is not uniform. Each row is shuffled.
+    # The algorithm draws a uniformly random set, but the order of the integers is not uniform. So rows are shuffled.
     return chosen.gather(1, unit((len(counts), k), generator).argsort(1))

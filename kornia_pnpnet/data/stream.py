@@ -18,7 +18,7 @@ from kornia_pnpnet.result import Problems
 
 __all__ = ["ProblemSource", "stream_batches"]
 
-# Number of batches that each worker draws in advance. A worker then stays busy while the caller runs a validation.
+# Number of batches that each worker draws in advance. Workers thus stay busy while the caller runs a validation.
 _AHEAD = 4
 
 
@@ -69,7 +69,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         for batch in arrays:
             yield tree_map_only(np.ndarray, torch.from_numpy, batch)
     finally:
-        end_workers()  # a traceback that refers to `arrays` would keep the workers alive
+        end_workers()  # otherwise, a traceback that refers to `arrays` would keep the workers alive
 
 
 def _draw_arrays(source: ProblemSource, index: int) -> Any:

@@ -38,12 +38,12 @@ _TINY = 1e-9
 _LEAST_COSINE = 0.05
 # If `half_image` is `None`: half the side of the largest image at focal length 1. Points may lie outside the image.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
-# The first `_LEAST_ORIGINALS` pairs of a problem are never copies. A choice: eight pairs can still determine a pose.
+# The first pairs of a problem are never copies. Their number is a choice: eight pairs can still determine a pose.
 _LEAST_ORIGINALS = 8
-# `_bunched` adds random blur to relative distances. Chosen limit of the blur: at 2, a bunch is hardly visible.
+# `_bunched` adds random blur to relative distances. The limit of the blur is a choice: at 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
 # Choices for confidences.
-_SEPARATION = (0.0, 4.0)  # mean score of inliers without noise minus mean score of outliers
+_SEPARATION = (0.0, 4.0)  # mean score of noise-free inliers minus mean score of outliers
 _NOISINESS = (0.0, 1.0)  # decrease of an inlier's score when log(1 + noise) grows by 1
 _GAIN = (0.3, 3.0)  # factor by which scores are multiplied to get logits
 _OFFSET = 1.5  # standard deviation of the random number that is added to all logits of a problem
@@ -73,7 +73,7 @@ class SyntheticProblems(RandomProblems):
         focal: focal length in pixels. The principal point is the pixel (0, 0).
         half_image: half the side, in pixels, of the square image with the centre (0, 0). The pixels of *sensing*
             outliers are uniform in the image. ``None`` means the smallest image that contains the pixels of all points
-            of a problem, limited to a field of view of 120°.
+            of a problem. The field of view of this image is at most 120°.
         img_sigma: standard deviation, in pixels, of the noise on each pixel coordinate, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
         degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range. 0 means Gaussian noise. With
@@ -81,20 +81,20 @@ class SyntheticProblems(RandomProblems):
             ``10 * img_sigma`` are outliers.
         sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. With a spread
             above 0, the sigmas of a batch have the shape ``(batch_size, n)``.
-        axis_ratio: largest standard deviation of a pair's noise along an axis divided by the smallest, at most 100. The
-            axes are random. With a ratio above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over the
-            axes, known noise is given as covariances, and ``known_noise`` must be 0 or 1.
+        axis_ratio: ratio of the largest to the smallest standard deviation over the axes of a pair's noise, at most
+            100. The axes are random. With a ratio above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over
+            the axes, known noise is given as covariances, and ``known_noise`` must be 0 or 1.
         known_noise: share of the problems that come with both sigmas. With 0, batches have no sigmas. With a share
             above 0, a third of the other problems come with one of the two sigmas, and missing sigmas are NaN.
         confidence_share: share of the problems that have confidences. The confidences of other problems are NaN. With
             a share of 0, batches have no confidences. Problems differ in how well confidences separate inliers from
-            outliers, and in the scale of the logits of confidences.
+            outliers, and in the scale of the confidences' logits.
         bunched_share: share of the problems in which all inliers, *near* outliers and *structured* outliers are bunched
             in one part of the image. The points of all other outliers come from the rest of the scene.
-        depth_maps: errors of depth cameras in the world points, in addition to the noise of ``world_sigma``. Known
-            noise does not include errors of depth cameras. ``None`` means no errors of depth cameras.
-        copies_share: share of the problems with copies of pairs, as from detectors that list a place several times. The
-            probability that a pair of such a problem is a copy is at most 0.5. The first 8 pairs are never copies.
+        depth_maps: errors of depth cameras in the world points, in addition to the noise of ``world_sigma``. The
+            noise given to solvers excludes these errors. ``None`` means no errors of depth cameras.
+        copies_share: share of the problems that contain copies of pairs, as if a detector lists a place several times.
+            A pair of such a problem is a copy with a probability of at most 0.5. The first 8 pairs are never copies.
         dtype: dtype of the batches. Numbers are drawn in float64.
         device: device of the batches. Numbers are drawn on the CPU.
 
@@ -277,7 +277,7 @@ class SyntheticProblems(RandomProblems):
         return known
 
     def _confidence(self, inliers: Tensor, errors: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw confidences, (B, N). ``errors``, (B, N), is the length of the pixel noise in standard deviations."""
+        """Draw confidences, (B, N). ``errors``, (B, N), has the pixel noise of each pair in standard deviations."""
         each = self.batch_size, 1
         separation, noisiness = (uniform(each, *bounds, generator) for bounds in (_SEPARATION, _NOISINESS))
         score = normal(inliers.shape, generator) + torch.where(inliers, separation - noisiness * errors.log1p(), 0.0)

@@ -27,7 +27,7 @@ def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResu
 
 
 class KnownInliers(Configured):
-    r"""Least squares of the reprojection errors of the true inliers, starting from the true pose.
+    r"""Least squares over the reprojection errors of the true inliers, starting from the true pose.
 
     A method that must first find the inliers cannot expect a higher accuracy.
     """

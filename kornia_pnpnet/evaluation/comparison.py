@@ -43,7 +43,7 @@ class EvaluationData(NamedTuple):
 
 @runtime_checkable
 class SeesTruth(Protocol):
-    """A bound: a module to which :func:`evaluate` passes the true poses and inliers."""
+    """A bound is a module to which :func:`evaluate` passes the true poses and inliers."""
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """Solve problems with the help of their true poses and inliers."""
@@ -83,7 +83,7 @@ def evaluate(
         solvers: solvers by name, called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode without
             gradients. A :class:`~kornia_pnpnet.solver.PnPNet` also gets :attr:`~kornia_pnpnet.result.Problems.known`.
             For bounds see :class:`SeesTruth`.
-        data: sets of problems by name. Each set is solved on its own device and in its own dtype.
+        data: sets of problems by name. Each set is solved on the device and in the dtype of its problems.
         path: the results file; ``None`` writes no file.
         overwrite: replace the file at ``path`` instead of continuing it.
         chunk: number of problems per call of a solver. A smaller number takes less memory.

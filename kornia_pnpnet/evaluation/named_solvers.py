@@ -29,15 +29,15 @@ _COMPETITORS = (
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
     *("kornia-rs", "poselib", "pycolmap"),
 )
-# Options of RANSAC for real scenes. On five scenes, with 0, 2 and 4 outliers in 9 pairs and a seed other than
-# `DEFAULT_SEED`, this threshold is the best of a grid from 3 to 60 px. Success hardly changes from 6 to 20 px.
+# Options of RANSAC for real scenes. This threshold is the best of a grid from 3 to 60 px on five scenes with 0, 2 and 4
+# outliers in 9 pairs. Success hardly changes from 6 to 20 px. The seed of these problems was not `DEFAULT_SEED`.
 _SCENE_OPTIONS = dict.fromkeys(
     ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
 )
-# Options of RANSAC for synthetic data. On problems with a seed other than `DEFAULT_SEED`, these thresholds are the best
-# of a grid from (3 px, 0.15 m) to (8 px, 0.4 m). Success varies by one percentage point over the grid.
+# Options of RANSAC for synthetic data. These thresholds are the best of a grid from (3 px, 0.15 m) to
+# (8 px, 0.4 m) on problems whose seed was not `DEFAULT_SEED`. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Module and name of each optional package. The key is the start of the names of the package's solvers.
+# Module and name of each optional package. The names of the package's solvers start with the key.
 _PACKAGES = {peer.source[1].lower(): peer.source for peer in (OpenCVPnP, KorniaRs, PoseLib, PyColmap)}
 
 
@@ -70,7 +70,7 @@ def load_solver(spec: str) -> nn.Module:
 
 
 def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic",)) -> list[str]:
-    """Names for :func:`load_solver`: the installed competitors and the bounds of the protocol.
+    """List the installed competitors and the bounds of the protocol by their names for :func:`load_solver`.
 
     Args:
         n: number of pairs per problem, or several such numbers.

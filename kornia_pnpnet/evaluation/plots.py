@@ -173,7 +173,7 @@ def plot_training(path: str | Path, history_csv: str | Path) -> Path:
 
 
 def log_scale(axes: Axes, name: str, formatter: Formatter | str = "{x:g}") -> None:
-    """Make the axis ``"x"`` or ``"y"`` logarithmic, with labels at powers of 10 and, on short axes, in between."""
+    """Make the axis ``"x"`` or ``"y"`` logarithmic. Labels are at powers of 10, and on short axes also in between."""
     axes.set(**{f"{name}scale": "log"})
     axis, (low, high) = getattr(axes, f"{name}axis"), getattr(axes, f"get_{name}lim")()
     axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5) if high < 100 * low else (1,)))

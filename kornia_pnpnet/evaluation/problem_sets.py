@@ -20,7 +20,7 @@ __all__ = ["DEFAULT_SEED", "PRIORS", "evaluation_sets"]
 DEFAULT_SEED = 12345
 
 _slab = partial(SyntheticProblems, points=SlabPoints())
-#: Synthetic sources by name. Each value holds a name, as in results files and ``conf/data``, and a constructor.
+#: Synthetic sources by name. Each value holds the name in results files and ``conf/data``, and a constructor.
 PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
     "synthetic": ("paper", SyntheticProblems),
     "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
@@ -29,12 +29,12 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
-# Number of problems per batch. A fixed number makes a set of 100 problems the start of a set of 1000 problems.
+# Number of problems per batch. With a fixed number, a set of 100 problems is the start of a set of 1000 problems.
 _DRAW_BATCH = 1000
 
 
 def _read_outliers(text: str, n: int, mismatches_only: bool) -> Iterator[tuple[str, OutlierMix, str | int]]:
-    """Parse ``--outliers``. Yield a label, a mix, and the entry of results (``none``, ``uniform`` or an integer)."""
+    """Parse ``--outliers``. Yield a label, a mix, and ``none``, ``uniform`` or an integer for the results file."""
     one, many, share = ("mismatch", "mismatches", 1.0) if mismatches_only else ("outlier", "outliers", 0.5)
     for word in map(str.strip, text.split(",")):
         if word == "uniform":
@@ -104,7 +104,7 @@ def evaluation_sets(
                 name = source  # an earlier scene has the same name
             # Raw matches already contain outliers, and the mix adds further outliers.
             added = "+" if scene is not None and source.endswith(".npz") else ""
-            suffix = ", noise told" if known_noise and scene is None else ""
+            suffix = ", noise given" if known_noise and scene is None else ""
             for size, label, mix, number in mixes:
                 options: dict[str, Any] = {"n": size, "outliers": mix, "seed": seed, "dtype": dtype}
                 description = {"outliers": number, "mismatch_share": mix.mismatch_share, "seed": seed}
@@ -113,7 +113,7 @@ def evaluation_sets(
                     prior, make = PRIORS[source]
                     problems = draw_problems(make(**options, **noise, batch_size=_DRAW_BATCH), count)
                     origin = {"source": prior}
-                else:  # mismatches get pixels of spare points; with `mismatches_only`, no two share a spare point
+                else:  # mismatches get pixels of spare points; with `mismatches_only`, no two mismatches share one
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
                     views = SceneProblems(scene, num_spares=spares, **options, batch_size=_DRAW_BATCH)
                     problems, origin = draw_problems(views, count), {"source": scene.name, "path": source}

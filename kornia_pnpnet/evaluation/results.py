@@ -31,7 +31,7 @@ _SHOWN_DIFFERENCES = 3
 
 
 def row_errors(row: Mapping[str, Any]) -> tuple[PoseErrors, Tensor]:
-    """Read the errors (float64) and ``ok`` (bool) of all problems of a row, each of the shape :math:`(B,)`.
+    """Read the errors (float64) and ``ok`` (bool) of a row's problems. Each tensor has the shape :math:`(B,)`.
 
     Raise ``ValueError`` for a row without per-problem errors. The repository's results files have only summaries.
     """
@@ -64,13 +64,13 @@ def load_results(path: str | Path) -> dict[str, Any]:
 
 
 def source_digest() -> str:
-    """Compute a digest of the package's Python files, which identifies the code that produced a row."""
+    """Compute a digest of the package's Python files. The digest identifies the code that produced a row."""
     root = Path(__file__).resolve().parents[1]
     return digest({path.relative_to(root).as_posix(): digest(path.read_bytes()) for path in root.rglob("*.py")})
 
 
 def differences(before: Any, now: Any, place: str = "") -> list[str]:
-    """List the entries that differ between nested plain data, for example ``refine.m was 3 and is 4``."""
+    """List the differences between two nested structures of plain data, for example ``refine.m was 3 and is 4``."""
     if isinstance(before, dict | None) and isinstance(now, dict | None):
         before, now = before or {}, now or {}
         pairs = [(key, before.get(key), now.get(key)) for key in {**before, **now}]

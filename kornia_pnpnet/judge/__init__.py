@@ -1,1 +1,1 @@
-"""Judge a pose: ``inliers`` finds its inliers by thresholds, and ``evidence`` decides whether the pose is believed."""
+"""Judge poses: ``inliers`` finds the inliers of a pose, and ``evidence`` decides whether a pose is believed."""

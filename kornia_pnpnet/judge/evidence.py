@@ -9,12 +9,12 @@ log-likelihood ratio
 
 leaves out its three largest positive terms, because some pose fits any three pairs. The vote :math:`v_i` is the inverse
 of the number of pairs with about the same pixel and point. Expectation-maximisation (EM) estimates :math:`w`. If the
-noise is unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1 or, with lower prior probability, a
-power of 8.
+noise is unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1, 8, 64, ..., and larger values have
+lower prior probabilities.
 
 Let :math:`M` be the mean of :math:`\exp L(s)`, weighted by the prior probability of :math:`s`. The *evidence* is
-:math:`\log M - \log n - \log k` for :math:`n` minimal samples and at most :math:`k` poses per sample. A pose is
-*believed* if its :func:`probability` suffices.
+:math:`\log M - \log n - \log k`, where :math:`n` is the number of possible minimal samples, and :math:`k` the largest
+number of poses per sample. A pose is *believed* if its :func:`probability` suffices.
 
 The results have no gradient.
 """
@@ -56,11 +56,11 @@ __all__ = [
 _LEAST_ANGLE = 1e-4
 # Ratio of neighbouring variances in the grid.
 _STEP = 8.0
-# Number of variances in the grid. The largest standard deviation is 0.018, or 14 pixels for a focal length of 800 px.
+# Number of variances in the grid. The largest standard deviation is 0.018 rad (14 px at a focal length of 800 px).
 _SCALES = 6
 # If the caller gave the noise, `s = 8^k` has a prior log-probability of k times this number.
 _UNEXPECTED = -3.0
-# Rounds of EM that estimate the share of inliers at each fixed `s`, and final rounds that estimate both `s` and share.
+# Number of EM rounds that estimate the share of inliers at each fixed `s`, and of final rounds that also estimate `s`.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
 # Real residuals have heavy tails: a share `_TAIL` of the inliers (the wide component) has `_WIDE` times the variance of
 # the rest. Without this component, success on indoor RGB-D matches falls by 2.5 percentage points.
@@ -68,7 +68,7 @@ _TAIL, _WIDE = 0.1, 9.0
 # Least share of inliers and of outliers.
 _LEAST_SHARE = 3e-3
 # Two pairs are copies if their pixels are in one cell of a grid, and their points are in one cell of another grid. The
-# unit of `_PIXEL_CELL` is the focal length, the unit of `_POINT_CELL` is that of the normalised world.
+# unit of `_PIXEL_CELL` is the focal length. `_POINT_CELL` is in the unit of the normalised world.
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Largest number of poses per minimal sample.
 _POSES = 4
@@ -76,7 +76,7 @@ _POSES = 4
 # number is transcendental, so that different rows of integers have different keys.
 _KEY = math.pi / 4
 
-#: Least :func:`probability` of a believed pose, about that of a Gaussian error within two standard deviations.
+#: Least :func:`probability` of a believed pose. A Gaussian error is within two sigmas with about this probability.
 LEAST_PROBABILITY = 0.955
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
 #: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.
@@ -100,10 +100,10 @@ class Votes(NamedTuple):
     """The quantities in the evidence that do not depend on the pose.
 
     Attributes:
-        pairs: the vote of each pair, the inverse of the number of its copies, 0 for padding, (B, N).
+        pairs: votes (B, N). A vote is 1 over the number of copies of the pair (with the pair itself), or 0 for padding.
         known: whether the caller gave any noise of the problem, bool (B, 1).
-        outlier: density of an outlier's pixel, divided by the peak of the narrow component of an inlier's density, for
-            a variance of 1 px² and equal shares of inliers and outliers, (B, 1).
+        outlier: density of an outlier's pixel, divided by the peak of the inliers' narrow component at a variance of
+            1 px², (B, 1). Inliers and outliers have equal shares here.
     """
 
     pairs: Tensor
@@ -130,7 +130,7 @@ class AtPose(NamedTuple):
 
     Attributes:
         projection: the points projected at the pose.
-        exponent: minus half the squared residual over the variance of the pixel, (B, N). Points behind the camera have
+        exponent: -1/2 times the squared residual divided by the pixel's variance, (B, N). Points behind the camera have
             about -∞.
         density: the square root of the determinant of ``precision``, (B, N) or (1, 1).
         outlier: ``Votes.outlier`` divided by ``density``, (B, N) or (B, 1).
@@ -153,8 +153,8 @@ class Mixture(NamedTuple):
     """The distribution of the residuals of a problem.
 
     Attributes:
-        variance: number by which the variances of the inliers are multiplied, shape (B, 1). If the problem has no
-            noise, the unit is px².
+        variance: number by which the variances of the inliers are multiplied, shape (B, 1). If ``problem.noise`` is
+            ``None``, the unit is px².
         share: share of inliers, shape (B, 1).
         least: lower bound of ``variance``, shape (B, 1). Without the bound, few pairs could make the variance 0.
         total: sum of the votes, shape (B, 1).
@@ -166,7 +166,7 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Relative densities (B, N): inliers, inliers with the wide component divided by 9, and outliers."""
+        """Relative densities (B, N) of inliers, of inliers with a ninth of the wide component, and of outliers."""
         # `exp2` is faster than `exp`. On a CPU (MKL), `exp` takes 50 times as long if the result underflows.
         scaled = exponent / (math.log(2.0) * self.variance)
         narrow, wide = scaled.exp2(), (scaled / _WIDE).exp2()
@@ -175,7 +175,7 @@ class Mixture(NamedTuple):
         return inlier, weighted, (self.variance / self.share - self.variance) * outlier
 
     def weights(self, seen: AtPose) -> Tensor:
-        """Robust weights (B, N): derivatives of the negative log-likelihood by ``-exponent / variance``, at most 1."""
+        """Robust weights (B, N), at most 1: derivatives of the negative log-likelihood by ``-exponent / variance``."""
         inlier, weighted, outlier = self.densities(seen.exponent, seen.outlier)
         return weighted / (inlier + outlier)
 
@@ -220,7 +220,7 @@ def copies(rows: Tensor, there: Tensor) -> Tensor:
 
 @torch.no_grad()
 def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
-    """Compute the evidence for a pose. The noise of the problem must be known for every pair, or ``None``."""
+    """Compute the evidence for a pose. ``problem.noise`` must be ``None``, or known for every pair."""
     exponent, density, outliers = (x.detach() for x in (seen.exponent, seen.density, seen.outlier))
     there, total = votes.pairs > 0, votes.pairs.sum(-1, keepdim=True).clamp(min=1.0)
     mean = torch.where(there, density.log(), 0.0).sum(-1, keepdim=True) / there.sum(-1, keepdim=True).clamp(min=1)
@@ -256,7 +256,7 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
 
 
 def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
-    """Project the points at a pose, and standardise the residuals. Without noise, the variance of a pixel is 1 px²."""
+    """Project the points at a pose, and standardise the residuals. With noise ``None``, a pixel's variance is 1 px²."""
     projection = project(state, problem)
     sq_residual, precision = information(projection, problem)
     exponent = torch.where(projection.in_front, -0.5 * sq_residual, -(torch.finfo(sq_residual.dtype).max ** 0.5))
@@ -288,10 +288,10 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, odds: Tensor | None = None) -> Tensor:
     """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
 
-    The result is the product of three probabilities: a logistic function of the evidence and of log :func:`pose_sigma`,
-    the probability :func:`within_limits`, and the logistic function of ``odds`` (B,), the log-odds of the pose against
-    other poses (``None``: there are none). The result is 0 if the points of the inliers lie on a line, or if the noise
-    is implausible, as with mirrored pixels. If ``known`` (B, 1), noise up to the caller's noise is plausible, too.
+    The result has three factors: a logistic function of the evidence and of log :func:`pose_sigma`, the probability
+    :func:`within_limits`, and the logistic function of ``odds`` (B,). ``odds`` are the log-odds of the pose against
+    other poses (``None``: no other poses). The result is 0 if almost all inliers' points lie on a line, or if the noise
+    is implausible, for example with mirrored pixels. If ``known`` (B, 1), noise up to the caller's noise is plausible.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
@@ -311,16 +311,16 @@ def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def within_limits(sigma: Tensor) -> Tensor:
-    """Probability that a Gaussian error with the standard deviation ``sigma`` is at most 1, float32."""
+    """Probability, in float32, that a Gaussian error of the standard deviation ``sigma`` is between -1 and 1."""
     return torch.erf(0.5**0.5 / sigma.float())
 
 
 def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Symmetric2) -> Tensor:
     """Standard deviation of the pose in units of the largest errors of a correct pose, float64, (B,).
 
-    The squared result sums the variances of rotation, translation and an unknown focal length (a change of distance).
-    ``precision`` is the inverse variance (or covariance) of each pixel in px^-2, (B, N), 0 for outliers. The result is
-    infinite for an undetermined pose.
+    The square of the result is the sum of the variances of rotation, translation and an unknown focal length. A change
+    of the focal length counts as a change of distance. ``precision`` is the inverse variance (or covariance) of each
+    pixel in px^-2, (B, N), 0 for outliers. The result is infinite if the pixels do not determine the pose.
     """
     precision = map_tensors(lambda x: problem.focal.square() * x, precision)
     matrix = normal_equations(projection, problem, precision).matrix
@@ -366,7 +366,7 @@ def _form(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
-    """Whether enough points (B, N, 3) of the inliers (B, N) lie off a line, bool (B,).
+    """Whether enough points (B, N, 3) of the inliers (B, N) lie off the line that fits them best, bool (B,).
 
     Points on a line leave one rotation free, so that a few outliers can determine this rotation by chance.
     """

@@ -70,7 +70,7 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
 
 
 def median_residual(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
-    """Median (B, 1) of squared residuals (B, N), of the pairs where ``there`` (B, N) is true. Infinite without a pair.
+    """Median (B, 1) of the squared residuals (B, N) where ``there`` (B, N) is true; infinite without such pairs.
 
     The median ignores the ``fitted`` smallest residuals, because a state can fit ``fitted`` pairs exactly.
     """
@@ -80,7 +80,7 @@ def median_residual(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS
 
 
 def residual_noise(projection: Projection, problem: Problem, weights: Tensor) -> Noise:
-    """Estimate the noise of the pixels from the median residual. All pairs of a problem have the same sigma."""
+    """Estimate the noise of the pixels from the median residual. All pairs of a problem get the same sigma."""
     there = (weights > 0) & projection.in_front
     variance = median_residual(projection.sq_residual.detach(), there) / (2.0 * math.log(2.0))
     focal = projection.focal.detach().reshape(-1, 1)

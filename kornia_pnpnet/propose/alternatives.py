@@ -21,18 +21,18 @@ from kornia_pnpnet.result import Alternatives, Pose
 
 __all__ = ["find_alternatives", "reconsider"]
 
-# Another pose is kept when the ratio of its likelihood to the likelihood of the refined pose exceeds this number.
+# Another pose is kept if its likelihood, divided by the likelihood of the refined pose, exceeds this number.
 _LIKELY = 1e-3
 # The logarithm of a likelihood ratio is clipped at this number, so that its exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum if two numbers are below _SAME: the angle between the rotations in radians, and the
-# shift of the mean point in the camera frame, divided by the distance of the mean point from the camera.
+# Two poses are the same minimum if their rotations differ by less than _SAME radians, and the mean point moves in the
+# camera frame by less than _SAME times its distance from the camera.
 _SAME = 0.035
 # A mirror image is refined if most inliers have residuals below this number times the spread of the inliers' pixels.
 _NEAR_MIRROR = 0.2
-# A rival is another pose that may explain the pairs. _WIDE_ANGLE (rad) is the least initial noise of the wide rival.
+# A rival is another candidate. The wide rival is the refined pose with a noise of at least _WIDE_ANGLE (rad).
 _WIDE_ANGLE = 6.4e-3
-# Index of the first entry of `Evidence.grid` with at least the noise _WIDE_ANGLE.
+# Index of the first entry of `Evidence.grid` whose noise is at least _WIDE_ANGLE.
 _WIDE_FROM = 4
 # The wide rival is tried only if the larger noise lowers the log-likelihood by less than this number per vote.
 _GAP = 0.4
@@ -52,12 +52,12 @@ _ITERATIONS = 12
 def find_alternatives(
     refine: RobustWeightedLM, problem: Problem, starts: Starts, pose: Pose, valid: Tensor, most: int
 ) -> Alternatives:
-    """Find at most ``most`` other minima that are nearly as likely as the pose, all in the frame of the problem.
+    """Find up to ``most`` other minima that are nearly as likely as the pose. All poses are in the problem's frame.
 
     The refinement starts from the mirror image of the pose, from the P3P solutions of three pairs that lie far apart,
     and from the poses of ``starts``. When the camera sees a plane almost from the front, the mirror image can be nearly
-    as likely as the pose without being a minimum. If the refinement of the mirror image ends at the pose, the unrefined
-    mirror image is therefore used. Problems that are not ``valid``, bool (B,), get no other poses.
+    as likely as the pose without being a minimum. Therefore, if the refinement of the mirror image ends at the pose,
+    the unrefined mirror image is used. Problems that are not ``valid``, bool (B,), get no other poses.
     """
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
     plan = refine.begin(problem, starts._replace(pose=pose, others=None, camera=None))
@@ -111,10 +111,10 @@ def reconsider(
     """Compare refined poses with rivals. If ``refine.by_residual`` is positive, each problem keeps its likeliest pose.
 
     If the noise is unknown and a larger noise is almost as likely, a rival starts from the refined pose with the
-    larger noise. If the mirror image of the pose has small residuals, another rival starts from the mirror image. A
-    given rival is used if its rotation differs from the rotation of the pose, and if not nearly all pairs are inliers
-    of the pose. A given rival starts with the noise of its own residuals. Without ``refine.by_residual``, only mirror
-    images are rivals. A rival that ends more than 10 degrees from the result makes the result less probable.
+    larger noise. If the mirror image of the pose has small residuals, a rival starts from the mirror image. If
+    ``replaced`` is ``None``, a given rival is used if its rotation differs from the pose's, unless nearly all pairs are
+    inliers of the pose. A given rival starts with the noise of its own residuals. If ``refine.by_residual`` is 0, only
+    mirror images and rivals in ``replaced`` are tried. Rivals over 10 degrees from the result lower its probability.
 
     Args:
         refine: the refiner.
@@ -124,11 +124,11 @@ def reconsider(
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
         rival: given rivals, for example of ``search_on``, or ``None``.
         replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. Other given rivals are
-            ignored. ``None``: the likelihood selects poses.
+            ignored. ``None``: given rivals compete by their likelihoods.
 
     Returns:
         The arguments of :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for the
-        states, and the log-odds of the states against the rivals. Without a rival, the log-odds are infinite.
+        states, and the log-odds against rivals over 10 degrees away. Without such rivals, the log-odds are infinite.
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
     with torch.no_grad():
@@ -198,13 +198,13 @@ def _moved(points: Tensor, pose: Pose) -> Tensor:
 
 
 def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
-    """Apply a half turn about the normal of the points, then the pose, then a half turn about the line of sight."""
+    """Apply a half turn about the best-fit plane's normal, then the pose, then a half turn about the line of sight."""
     middle = _mean(problem.world_points, shares)
     centred = problem.world_points - middle[:, None]
     covariance = torch.bmm(centred.mT, shares[..., None] * centred)
     if covariance.device.type == "cpu":  # LAPACK raises an error for the whole batch if one matrix has NaN
         normal = torch.linalg.eigh(covariance.nan_to_num(0.0, 0.0, 0.0)).eigenvectors[..., 0]
-    else:  # cuSOLVER takes 250 KiB for each matrix, and fails for 100,000 matrices
+    else:  # cuSOLVER needs 250 KiB for each matrix, and fails for 100,000 matrices
         normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
     seen = torch.baddbmm(pose.translation[..., None], pose.rotation, middle[..., None])
     rotation = torch.bmm(torch.bmm(_half_turn(seen[..., 0]), pose.rotation), _half_turn(normal))

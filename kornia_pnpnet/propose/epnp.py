@@ -32,12 +32,12 @@ __all__ = ["ControlPoints", "EPnP", "control_points"]
 _PLANAR_RATIO = 1e-3
 # A problem that is `ok` has at least _MIN_PAIRS pairs, and at least _MIN_IN_FRONT of them are in front of the camera.
 _MIN_PAIRS, _MIN_IN_FRONT = 4, 3
-# Number of Gauss-Newton steps of each of the four cases, before the best case is chosen.
+# Number of Gauss-Newton steps that each case takes before the best case is chosen.
 _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
-# Size of the ridge of `_null_space`, divided by the squared spread of the pixels. Among null vectors with equal errors,
-# the ridge puts null vectors along the longest extents of the world first.
+# Size of the ridge of `_null_space`, divided by the squared spread of the pixels. If null vectors have equal errors,
+# the ridge sorts them by the extent of the world, longest first.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
@@ -104,11 +104,11 @@ class EPnP(Initialiser):
     the control points. Planar points use the same equations, with 0 as the last control vector.
 
     Four or five pairs can have up to four solutions. The solution with the least reprojection error may then be
-    incorrect. A problem is not ``ok`` with fewer than four pairs, with points on a line, or with fewer than three pairs
-    in front of the camera. The gradient of the pose follows from the implicit function theorem.
+    incorrect. A problem is not ``ok`` if it has fewer than four pairs, if its points lie on a line, or if fewer than
+    three pairs are in front of the camera. The gradient of the pose follows from the implicit function theorem.
 
     Args:
-        iterations: number of Gauss-Newton steps, at least 2. Each case takes two steps; the best case takes the rest.
+        iterations: number of Gauss-Newton steps of the best case, at least 2. Each other case takes two steps.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
             distances, in a world with a root mean square radius of 1. The paper's weight is 0.
 
@@ -254,7 +254,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
 
 
 def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""For `_minimize`: half the matrix (4, 4, C, B), half the gradient (4, C, B), and DᵀD - LᵀL (3, 3, C, B)."""
+    r"""For `_minimize`: half the normal matrix (4, 4, C, B), half the gradient (4, C, B), DᵀD - LᵀL (3, 3, C, B)."""
     vectors = _in_camera(system, depths)[:, 1:]
     columns = vectors.transpose(0, 1)
     misfit = small_product(columns, vectors) - system.gram
@@ -266,7 +266,7 @@ def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Ten
 
 
 def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
-    r"""Minimise :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` by Gauss-Newton steps (paper: six distances)."""
+    r"""Minimise :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` by Gauss-Newton; the paper has six distances."""
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(system, depths)
         (step,) = solve_leading([row.unbind(0) for row in normal.unbind(0)], gradient.unbind(0), (4,))
@@ -275,7 +275,7 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 
 
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
-    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem. They are 0 if a minimum is not isolated.
+    r"""Attach gradients to minima (4, 1, B) by the implicit function theorem. Gradients of degenerate minima are 0.
 
     Two Newton steps with a constant matrix make first and second derivatives exact. The values do not change.
     """
@@ -283,7 +283,7 @@ def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Te
         normal, _, misfit = _normal_equations(system, depths)
         for rows in system.maps[:, 1:].unbind(0):
             normal = normal + 2.0 * small_product(rows.transpose(0, 1), small_product(misfit, rows))
-        # The last control vector of planar points is 0. A 1 on the diagonal makes their system regular.
+        # The last control vector of planar points is 0. A 1 on the diagonal makes the system regular.
         normal[3, 3] += planar
         eye = torch.eye(4, dtype=depths.dtype, device=depths.device)[..., None].expand_as(normal[:, :, 0])
         columns, solved = solve_positive(normal.expand(-1, -1, 4, -1).flatten(2), eye.flatten(1), depths.new_zeros(()))

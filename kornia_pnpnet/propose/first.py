@@ -60,7 +60,7 @@ def propose(
         starts = _starts_of_rig(problem, given, with_noise=trait(init, "estimates_noise"), fixed=fixed)
     elif trait(init, "takes_given"):
         starts, given = init(problem, given), None
-    elif views > 1:
+    elif views > 1 and problem.rig is None:
         starts = from_views(init, problem, views, order)
     else:
         starts = init(problem, search_follows=True) if search_follows else init(problem)

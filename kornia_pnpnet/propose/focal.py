@@ -24,12 +24,12 @@ __all__ = ["as_dist", "distorted", "find_focal", "scale_focal", "with_found_foca
 
 # Shortest and longest focal length of the search, in half image widths. The fields of view are 118 and 14 degrees.
 _SHORTEST, _LONGEST = 0.6, 8.0
-# Half of the range of log f.
+# Half the range of log f.
 _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
 # Ratio of half the image width to the median distance (maximum norm) of the pixels from the centre. The ratio is exact
 # for pixels that are uniformly distributed in a square image.
 _HALF_WIDTH = math.sqrt(2.0)
-# Half the range of log f in standard deviations, if the caller expects a focal length.
+# If the caller expects a focal length, half the range of log f is this number of standard deviations.
 _SEARCHED = 2.0
 # Inlier threshold in pixels of the normalised camera. At the middle focal length, it is 0.65 % of half the image width.
 _THRESHOLD = 10.0
@@ -41,7 +41,7 @@ _STEPS = 14
 # Lower bound, in focal lengths, of the kernel's scale in the first step. For example, a distortion of k1 = 0.2 shifts a
 # pixel at a radius of 0.7 by 0.2 * 0.7^3 = 0.07.
 _WIDE = 0.07
-# After each step, the lower bound _WIDE is multiplied by _SHRINK, but the bound never falls below _LEAST.
+# After each step, this lower bound is multiplied by _SHRINK, but never falls below _LEAST.
 _SHRINK, _LEAST = 0.6, 1e-5
 
 
@@ -51,8 +51,8 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> 
     If ``sigma``, the standard deviation of log f, is given, the range lies around the caller's focal length. Otherwise
     the range is proportional to the size of the image. The size is twice the principal point or, if larger, an estimate
     from the median distance of the pixels from the principal point. The aspect ratio and the signs of fx and fy are
-    kept. Matrices that are no pinhole cameras become NaN. ``radial`` is the number of coefficients of radial distortion
-    to estimate.
+    kept. Matrices that are not pinhole cameras become NaN. ``radial`` is the number of coefficients of radial
+    distortion to estimate.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = focal_length(camera)  # (B,)

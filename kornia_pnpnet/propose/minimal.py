@@ -17,7 +17,7 @@ __all__ = ["MinimalSolver", "SubsetSolver", "describe"]
 
 
 class MinimalSolver(Protocol):
-    """Solves samples of ``sample_size`` pairs each, for example :class:`~kornia_pnpnet.propose.p3p.P3P`."""
+    """A solver for samples of ``sample_size`` pairs. :class:`~kornia_pnpnet.propose.p3p.P3P` is an example."""
 
     @property
     def sample_size(self) -> int:

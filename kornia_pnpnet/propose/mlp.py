@@ -17,7 +17,7 @@ __all__ = ["MLPInit", "rotation_about"]
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Module]:
-    """Linear layers with ReLU and He initialisation. Ten narrow layers of PyTorch's default would lose the signal."""
+    """Linear layers with ReLU and He initialisation. PyTorch's default would lose the signal in ten narrow layers."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         linear = nn.Linear(size_in, size_out)

@@ -64,18 +64,18 @@ def _greater(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Flags (C,): whether one cyclic step, or two, moves the largest of three values (3, C) to the front."""
+    """Flags (C,): whether the second of three values (3, C) exceeds the first, and whether the third exceeds both."""
     first, second, third = values
     return _greater(second, first), _greater(third, torch.maximum(first, second))
 
 
 def _turned(triple: Tensor, turn: tuple[Tensor, Tensor], step: int = 1) -> Tensor:
-    """Shift triples (3, *, C) cyclically as the flags ``turn`` say. With ``step=-1``, undo the shift."""
+    """Shift triples (3, *, C) cyclically by the flags of `_turn_to_largest`. With ``step=-1``, undo the shift."""
     return triple.lerp(triple.roll(-step, 0), turn[0]).lerp_(triple.roll(step, 0), turn[1])
 
 
 def _sqrt(square: Tensor) -> Tensor:
-    """The square root of a positive number, faster than ``torch.sqrt``."""
+    """Square root of positive numbers. This formula is faster than ``torch.sqrt``."""
     return square.rsqrt().mul_(square)
 
 
@@ -89,7 +89,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """Find the real root ``u : v`` that is farthest from the other two roots of a cubic form with coefficients (4, C).
 
-    If two solutions of P3P nearly coincide, two roots do so, too. The third root gives a line through both solutions.
+    If two solutions of P3P nearly coincide, two roots also do. The third root gives a line through both solutions.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -167,7 +167,7 @@ def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
 
 
 def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
-    """Four candidates (3, 2, 2, C) for the distances of a triangle whose edge 1 is the longest and has the length 1.
+    """Four candidates (3, 2, 2, C) for the distances of three points. Edge 1 is the longest, and has the length 1.
 
     ``p`` and ``q`` (C,) are the squared lengths of the edges 3 and 2, and ``r`` is ``1 - p - q`` without rounding. The
     module defines ``b`` (3, C) and ``g`` (C,). All candidates are finite, and their first distance is not negative.
@@ -334,8 +334,8 @@ class _Solve(torch.autograd.Function):
 def minimal_poses(world_points: Tensor, plane_points: Tensor) -> tuple[Tensor, Tensor]:
     """Solve P3P for world points (B, 3, 3) and plane points (B, 3, 2) of one dtype, see :func:`p3p`.
 
-    The fifth powers of coordinates must not overflow or underflow. Returns four poses as entries (12, 4, B), see
-    :func:`~kornia_pnpnet.propose.scoring.as_pose`, and which of the four slots are valid, (4, B).
+    The fifth powers of coordinates must not overflow or underflow. Returns the entries (12, 4, B) of four poses (see
+    :func:`~kornia_pnpnet.propose.scoring.as_pose`), and whether each pose is valid, (4, B).
     """
     entries, valid = (_solve if compiling() else _Solve.apply)(world_points.detach(), plane_points.detach())
     return entries, valid
@@ -389,7 +389,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
     dtype = common_dtype({"world_points": world_points, "plane_points": plane_points})
     world = world_points.detach().to(dtype)
     largest = world.abs().amax((-2, -1), keepdim=True).clamp(min=torch.finfo(dtype).tiny)
-    unit = largest.log2().floor().exp2()  # a power of two, because rounding could separate double solutions
+    unit = largest.log2().floor().exp2()  # a power of two avoids rounding, which could separate double solutions
     entries, valid = minimal_poses((world / unit).reshape(-1, 3, 3), plane_points.to(dtype).reshape(-1, 3, 2))
     (rotation, translation), valid = as_pose(entries.permute(2, 1, 0).reshape(*size, 4, 12)), valid.mT.reshape(*size, 4)
     return Hypotheses(Pose(rotation, torch.where(valid[..., None], translation * unit, 0.0)), valid)
@@ -399,7 +399,7 @@ class P3P(Configured):
     r"""Minimal solver of three pairs for :class:`~kornia_pnpnet.propose.ransac.RANSAC`: :func:`p3p` as a module.
 
     If the focal length is unknown, each sample is solved at every focal length of a geometric grid (see
-    :class:`~kornia_pnpnet.refine.terms.CameraTerm`). The refinement then finds focal lengths between those of the grid.
+    :class:`~kornia_pnpnet.refine.terms.CameraTerm`). The refinement then finds focal lengths between the grid's values.
 
     Example:
         >>> problem = Problem.of(torch.randn(7, 3, 3), torch.randn(7, 3, 2))

@@ -8,8 +8,8 @@ direction :math:`r_k`. The unknowns are the distances :math:`d_k > 0` along the 
 
 There are up to eight solutions (D. Nistér, "A minimal solution to the generalised 3-point pose problem", CVPR 2004).
 For a given :math:`d_1`, one equation gives up to two :math:`d_2`, and another equation gives up to two :math:`d_3`. All
-four solutions are real in one interval of :math:`d_1`. On each branch, a choice of :math:`d_2` and :math:`d_3`, the
-third equation is a function of :math:`d_1` alone. Newton's method starts where one of these functions changes its sign.
+four values are real in one interval of :math:`d_1`. A *branch* is a choice of :math:`d_2` and :math:`d_3`. On a branch,
+the third equation depends on :math:`d_1` alone. Newton's method starts where the error of this equation changes sign.
 
 The last dimension of every tensor has B problems or M solutions.
 """
@@ -29,8 +29,8 @@ from kornia_pnpnet.propose.scoring import as_pose
 
 __all__ = ["P3PRig"]
 
-# Number of distances d_1 at which the third equation of each branch is evaluated. Two solutions between neighbouring
-# distances are missed. If cameras look in all directions, 4 % of the poses are missed.
+# Number of distances d_1 at which the third equation of each branch is evaluated. If two solutions of a branch lie
+# between neighbouring distances, both are missed. If cameras look in all directions, 4 % of the poses are missed.
 _DISTANCES = 16
 # Largest number of solutions, and number of Newton steps.
 _SOLUTIONS, _STEPS = 8, 6
@@ -60,7 +60,7 @@ class _Branches(NamedTuple):
         return cls(ahead, 1.0 + gain, offset - ahead * ray, change - gain * ray, sq_side)
 
     def interval(self) -> tuple[Tensor, Tensor]:
-        """Least and largest distance of pair 1 with real solutions. The least is larger if no solution is real."""
+        """Least and largest distance of pair 1 with real solutions. If none exist, the least exceeds the largest."""
         sq_tilt = self.tilt.square().sum(0).clamp(min=torch.finfo(self.tilt.dtype).eps ** 2)  # for parallel rays
         middle = -(self.aside * self.tilt).sum(0) / sq_tilt
         sq_half = middle.square() + (self.sq_side - self.aside.square().sum(0)) / sq_tilt
@@ -143,7 +143,7 @@ def _starts(
 def _newton(
     world_points: Tensor, rays: Tensor, centres: Tensor, sides: Tensor, ranges: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Newton's method from distances ``ranges`` (3, M): rotations, translations, and which poses are solutions."""
+    """Run Newton's method from distances ``ranges`` (3, M). Returns rotations, translations, and validity (M,)."""
     first, second = [0, 0, 1], [1, 2, 2]
     for step in range(_STEPS + 1):
         points = centres + ranges[:, None] * rays
@@ -157,7 +157,7 @@ def _newton(
         steps_by_det = torch.stack((g * d * e + b * both, a * both + g * c * f, b * c * k + e * (g * c - a * h)))
         ranges = ranges + steps_by_det / (a * d * e - b * c * f)
     exact = (gap.abs() < _EXACT * sides).all(0) & (ranges > 0).all(0)
-    # The rotation maps two sides and the normal of the world triangle to those of the camera triangle.
+    # The rotation maps two sides and the normal of the world triangle to their counterparts in the camera triangle.
     cam = [-edge[0], -edge[1], torch.linalg.cross(edge[0], edge[1], dim=0)]
     world = [world_points[1] - world_points[0], world_points[2] - world_points[0]]
     normal = torch.linalg.cross(*world, dim=0)

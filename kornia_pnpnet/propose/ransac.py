@@ -23,7 +23,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["RANSAC", "search_on"]
 
-# A pose can fit this number of inliers closely even if their pixels are noisy.
+# A pose can fit this number of inliers closely even if the pixels are noisy.
 _FITTED = 5
 # Largest residuals of an inlier in `search_on`, in standard deviations. The first limit is for noise that a network
 # estimates. Such estimates are too small when most pairs are outliers. The second limit is for the caller's noise.
@@ -32,27 +32,27 @@ _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # the median distance of the pixels from the principal point. The number was tuned on random problems with fields of
 # view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# `search_on` converts the noise of points to pixels at the depth of the pose. Smaller depths are raised to this depth
-# in units of the normalised world.
+# `search_on` converts the noise of points to pixels at the depth of the pose. This number is the lower bound of the
+# depth, in units of the normalised world.
 _NEAREST = 0.5
-# _DOUBT is the chance to draw a pair of weight 0 over the chance to draw a pair of weight 1. _LEAST_TRUST is this ratio
-# for confidences 0 and 1, and smaller, because a caller's confidences are more reliable than a network's weights.
+# _DOUBT is the chance that a pair of weight 0 is drawn, divided by the chance for weight 1. _LEAST_TRUST is this ratio
+# for confidences 0 and 1. The second ratio is smaller, because confidences are more reliable than a network's weights.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
 class RANSAC(Initialiser):
-    r"""The pose with the best score among the poses of many samples, improved on its inliers.
+    r"""Find the pose with the best score among the poses of many samples, and improve this pose on its inliers.
 
     The samples of all problems are solved as one batch, in rounds. If a round finds a better pose, least squares on
-    the inliers improve this pose (LO-RANSAC). The search of a problem ends when the probability that a sample without
-    outliers was drawn reaches ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
-    drawn twice. All problems and calls share the same random numbers, so that, up to rounding, the result of a problem
+    the inliers improve this pose (LO-RANSAC). The search of a problem ends when, with probability ``confidence``, at
+    least one drawn sample has no outlier. If a problem has at most ``max_samples`` possible samples, no sample is drawn
+    twice. All problems and calls share the same random numbers. Except for rounding, the result of a problem therefore
     does not depend on the batch. Pairs of a large confidence are drawn more often than other pairs.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
-    least squares, the weight of an inlier is the inverse of the right-hand side of this inequality. The final steps
-    multiply this weight by that of a Cauchy kernel. The steps start from a constant pose close to the minimum, and have
-    gradients with respect to points, pixels and weights. The choice of inliers and the right-hand side are constant.
+    least squares, the weight of an inlier is :math:`\tau^2` divided by the right-hand side. The final steps multiply
+    this weight by the weight of a Cauchy kernel. These steps start from a detached pose close to the minimum, and have
+    gradients with respect to points, pixels and weights. The choice of inliers and the first factor have no gradient.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
@@ -127,7 +127,7 @@ class RANSAC(Initialiser):
         r"""Find the poses.
 
         Args:
-            problem: normalised problems of a centred world, because the search computes in float32.
+            problem: normalised problems. The world must be centred, because the search computes in float32.
             given: one pose per problem, which competes with the poses of the samples.
 
         Returns:
@@ -135,7 +135,7 @@ class RANSAC(Initialiser):
 
         Raises:
             ShapeError: when a problem has fewer pairs than a sample.
-            NotImplementedError: inside of ``torch.func.vmap``.
+            NotImplementedError: inside of ``torch.func.vmap``, or on the device ``meta``.
         """
         size = self.minimal.sample_size
         if problem.weights.shape[1] < size:
@@ -204,12 +204,12 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
     Least squares improve the best pose of the starts. A problem is searched only if the inliers of this pose require
-    more than 64 samples for a confidence of 0.999. A pair of the weight :math:`w` in the starts is drawn with a chance
-    proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
+    more than 64 samples for a confidence of 0.999. Let :math:`w` be the weight of a pair in the starts. The chance that
+    this pair is drawn is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
     A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
-    limit is five standard deviations. If the caller gave no noise, all pairs have the same standard deviation, the mean
-    of the estimates. Noise of points is converted to pixels at the depth of the world's origin in the first pose. If
+    limit is five standard deviations. If the caller gave no noise, the standard deviation of every pair is the mean of
+    the estimates. Noise of points is converted to pixels at the depth of the world's origin in the first pose. If
     each pose used its own depths, a pose close to the points would have the most inliers.
 
     Args:
@@ -218,8 +218,8 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
         keep_others: whether to keep the other poses of the starts. With few pairs, the best pose can be incorrect.
 
     Returns:
-        First, the starts with the best pose, without gradient. In a searched problem, the weights are those of a Cauchy
-        kernel at the best pose, with the inlier threshold as its scale. Second, the pose with the least loss at wider
+        First, the starts with the best pose, without gradient. In a searched problem, a Cauchy kernel at the best pose
+        gives the weights. The kernel's scale is the inlier threshold. Second, the pose with the least loss at wider
         thresholds, for the comparison with the refined pose (see `reconsider`).
 
     Raises:

@@ -26,8 +26,8 @@ __all__ = ["REPPnP"]
 
 # Number of iterations of outlier rejection, first with the null vector, then with the rigid motion.
 _NULL_ITERATIONS, _RIGID_ITERATIONS = 3, 4
-# Least numbers of pairs that outlier rejection keeps: with the null vector, which 6 pairs determine, and with the rigid
-# motion, which 3 pairs determine.
+# Least numbers of pairs that outlier rejection keeps, first with the null vector, then with the rigid motion. 6 pairs
+# determine the null vector, and 3 pairs determine the rigid motion.
 _NULL_FLOOR, _RIGID_FLOOR = 7, 5
 # A problem needs at least this number of pairs to be `ok`.
 _MIN_PAIRS = 4
@@ -102,8 +102,8 @@ class REPPnP(Initialiser):
 
         Returns:
             The pose, weights, and ``ok``. The weight is 1 for kept pairs and for unusual pairs (see ``Problem.usual``),
-            and 0 for other pairs. A problem is not ``ok`` with fewer than 4 pairs, with points on a line, with
-            equations that do not determine a pose, or with the centroid of the points behind the camera.
+            and 0 for other pairs. A problem is not ``ok`` if it has fewer than 4 pairs, if its points lie on a line, if
+            the equations do not determine a pose, or if the centroid of the points is behind the camera.
         """
         problem = problem._replace(weights=problem.usual_weights)
         with torch.no_grad():
@@ -166,7 +166,7 @@ class REPPnP(Initialiser):
         return weights, pose
 
     def _keep(self, pairs: _Pairs, sq_error: Tensor, floor: int) -> Tensor:
-        """Weights (B, N), 0 if the error exceeds the quantile and ``max_error``. At least ``floor`` pairs are kept."""
+        """Weights (B, N), 0 if the error exceeds both quantile and ``max_error``. At least ``floor`` pairs are kept."""
         count = pairs.there.sum(-1, keepdim=True, dtype=sq_error.dtype)  # (B, 1)
         rank = (self.quantile * count).ceil().long().clamp(min=floor)
         rank = rank.clamp(max=sq_error.shape[-1]) - 1
@@ -196,7 +196,7 @@ def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
 
 
 def _null_vector(rows: Tensor, weights: Tensor, depth_prior: float) -> tuple[Tensor, Tensor]:
-    """Inverse normal matrix (B, 11, 11), and null vector (B, 12, 1), whose last entry is the centroid's depth, 1."""
+    """Inverse normal matrix (B, 11, 11), and null vector (B, 12, 1). The last entry, the centroid's depth, is 1."""
     normal = _normal_matrix(rows, weights)
     inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8).to(normal))
     return inverse, torch.cat((-(inverse @ normal[..., -1:]), torch.ones_like(normal[:, :1, :1])), 1)
@@ -224,8 +224,8 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
 def _leave_one_out(rows: Tensor, inverse: Tensor, pairs: _Pairs, weights: Tensor) -> Tensor:
     r"""Squared leave-one-out errors :math:`e^\top (1 \mp w H)^{-1} e` (B, N) with the leverage :math:`H`.
 
-    The error is the change of the cost, divided by the weight :math:`w`, when a kept pair is removed (minus) or a
-    rejected pair is added (plus).
+    If a kept pair is removed (minus), or a rejected pair is added (plus), the cost changes. The error is this change
+    divided by the weight :math:`w` of the pair.
     """
     jacobian, count = rows[:, :-1], weights.shape[-1]
     solved = inverse @ jacobian

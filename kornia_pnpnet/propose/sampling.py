@@ -37,7 +37,7 @@ def kept_at_once(count: int, like: Tensor) -> int:
 
 @torch.no_grad()
 def ranked(problem: Problem, present: Tensor) -> Tensor:
-    """Positions (B, N) of the present pairs, before those of absent pairs, in an order that depends on the pairs alone.
+    """Find positions (B, N) that sort the pairs by their pixels and points. Absent pairs come last.
 
     If a search takes the pairs in this order, its poses do not depend on the order in which the caller gave the pairs.
     """
@@ -48,7 +48,7 @@ def ranked(problem: Problem, present: Tensor) -> Tensor:
 
 @torch.no_grad()
 def spread_evenly(present: Tensor, count: int) -> Tensor:
-    """Indices (B, count) of evenly spread present pairs. If fewer than ``count`` pairs are present, absent ones follow.
+    """Indices (B, count) of evenly spread present pairs. If fewer than ``count`` are present, absent pairs follow.
 
     Multiples of the golden ratio shift the positions slightly, so that the selection does not follow a periodic pattern
     in the order of the pairs. No position occurs twice, unless the problem has fewer than ``count`` pairs.
@@ -172,7 +172,7 @@ class Samples:
         return samples_needed(mass * count, count, self.size, confidence)
 
     def spread(self, problems: Tensor, count: int) -> Tensor:
-        """Indices (P, count) of the pairs at evenly spaced values of their cumulative chances."""
+        """Indices (P, count) of the pairs at evenly spaced values of the cumulative chances."""
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
         return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
@@ -190,7 +190,7 @@ def _random_numbers(size: int, most: int, seed: int) -> Tensor:
 
 @lru_cache(maxsize=256)
 def _subsets(count: int, size: int, seed: int) -> Tensor:
-    """List all subsets of ``size`` among ``count`` items, (C, size). The seed determines their random order."""
+    """List all subsets (C, size) of ``size`` out of ``count`` items. The seed determines their random order."""
     table = torch.combinations(torch.arange(max(count, size), device="cpu"), size)
     return table[torch.from_numpy(np.random.default_rng(seed).permutation(len(table)))]
 
@@ -199,8 +199,8 @@ def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float
     r"""Number of samples needed for a probability ``confidence`` that at least one sample has no outlier, float64 (B,).
 
     The number is :math:`\log(1-p) / \log(1-w)` for the confidence :math:`p`. The share of samples without an outlier is
-    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs (the counts may be fractions)
-    (M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B).
+    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs. Both counts may be fractions.
+    Source: M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B.
     """
     drawn = torch.arange(size, dtype=torch.float64, device=inliers.device)
     shares = (inliers[:, None] - drawn).clamp(min=0.0) / (counts[:, None] - drawn).clamp(min=1.0)

@@ -53,7 +53,7 @@ def as_pose(entries: Tensor) -> Pose:
 
 
 def as_entries(pose: Pose) -> Tensor:
-    """The inverse of :func:`as_pose`, (*, 12)."""
+    """Convert poses to the entries (*, 12) of :func:`as_pose`."""
     return torch.cat((pose.rotation, pose.translation[..., None]), -1).flatten(-2)
 
 

@@ -33,9 +33,9 @@ _T = TypeVar("_T")
 _DTYPE = torch.float32
 # Largest number of samples that a CPU solves and scores at once, so that the tensors fit into a core's caches.
 _SAMPLES_AT_ONCE = 8192
-# A round has _GROWTH times as many samples as all earlier rounds, at least `min_samples`, and at most _LARGEST_ROUND.
+# A round has _GROWTH times the samples of all earlier rounds, but at least `min_samples` and at most _LARGEST_ROUND.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
-# If the remaining samples fill at most _ROUNDS_LEFT rounds, or are at most _FEW_SAMPLES, a round draws all of them.
+# A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds, or if at most _FEW_SAMPLES are left.
 # With few pairs, the pose then does not depend on the order of pairs, and rounding does not decide when a search ends.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
 # After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, but at least _FIRST_PAIRS. If k
@@ -47,25 +47,25 @@ _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
 _KEPT_ONE_IN, _MORE = 2, 4
 # If (slots for poses) x (pairs) is at most this number, scoring the empty slots is faster than removing them.
 _FEW_RESIDUALS = 4096
-# Each round improves this number of poses with the smallest losses. The best improved pose is then improved again.
+# Number of poses with the smallest losses that each round improves. The best improved pose is then improved again.
 _IMPROVED = 3
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
 # Square of the wider threshold at which rivals are scored, divided by the squared inlier threshold.
 _WIDER = 16.0
-# The entrywise product of a rotation and of the rotation after a Newton step sums to 3. If the sum for a matrix differs
-# from 3 by at least this number, the matrix is no rotation.
+# A Newton step maps a matrix M to N. For a rotation, N = M, and the entrywise product of M and N sums to 3. If the sum
+# differs from 3 by at least this number, M is not a rotation.
 _FAR_FROM_ROTATION = 0.1
-# Relative damping of a least-squares step, small because the start is close to the minimum.
+# Relative damping of a least-squares step. The damping is small, because the start is close to the minimum.
 _DAMPING = 1e-6
 # Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
 # the pose of a minimal sample than at an improved pose.
 _LIMITS = 3.0, 1.0
-# If `pose_sigma` exceeds _OPEN, an incorrect pose may have as many inliers as the correct pose, for example in a flat
-# scene and a narrow field of view. At least _OPEN_SAMPLES samples are then drawn.
+# If `pose_sigma` exceeds _OPEN, an incorrect pose may have as many inliers as the correct pose, for example if a flat
+# scene is seen in a narrow field of view. At least _OPEN_SAMPLES samples are then drawn.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
-# After _PLAIN_SAMPLES samples, which take as long as `agreement_of_neighbours`, the chance that a pair is drawn is
-# multiplied by (a + agreement)^b. The numbers a = _LEAST_AGREEMENT and b = _AGREEMENT_POWER were chosen empirically.
+# The first _PLAIN_SAMPLES samples take as long as `agreement_of_neighbours`. Then the chance of each pair is multiplied
+# by (a + agreement)^b. The numbers a = _LEAST_AGREEMENT and b = _AGREEMENT_POWER were chosen empirically.
 _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
@@ -90,14 +90,14 @@ class Search:
 
     Args:
         plan: options of the search.
-        problem: problems whose points are centred at the origin, because the search computes in float32.
-        thresholds: thresholds of an inlier.
-        chances: relative probabilities that pairs are inliers, shape :math:`(B, N)`, or ``None`` if they are equal.
+        problem: problems. The points must be centred at the origin, because the search computes in float32.
+        thresholds: inlier thresholds.
+        chances: relative chances that pairs are drawn, shape :math:`(B, N)`. ``None``: all chances are equal.
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`. If ``None``, the search
             estimates the standard deviation from the residuals of the inliers.
         finds_rivals: whether the search finds ``rivals``.
-        ranks: whether to search the pairs in the order :func:`~kornia_pnpnet.propose.sampling.ranked`, so that poses do
-            not depend on the order of the caller.
+        ranks: whether to sort the pairs by :func:`~kornia_pnpnet.propose.sampling.ranked`. Poses then do not depend on
+            the caller's order of the pairs.
 
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
@@ -159,7 +159,7 @@ class Search:
                 number of samples.
 
         Returns:
-            The indices, in the batch, of the problems from which samples were drawn.
+            The batch indices of the problems from which samples were drawn.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -232,7 +232,7 @@ class Search:
         return Samples(chances, size=self.minimal.sample_size, most=self.plan.max_samples, seed=self.plan.seed)
 
     def _prefer_agreement(self, problems: Tensor) -> None:
-        """In some problems, multiply the chance of each pair by (a + agreement)^b, see `_PLAIN_SAMPLES`."""
+        """In the given problems, multiply the chance of each pair by (a + agreement)^b, see `_PLAIN_SAMPLES`."""
         world, img, weights = take(self.problem[:3], problems)
         agreement = agreement_of_neighbours(world, img, weights > 0)
         chances = self.chances.clone()
@@ -240,10 +240,10 @@ class Search:
         self.samples = self._samples(chances)
 
     def _expect(self, at: Tensor) -> None:
-        """Estimate how many samples some problems need, from the inliers of their best poses.
+        """Estimate the number of samples that the given problems need, from the inliers of their best poses.
 
         After `_prefer_agreement`, the estimate is the geometric mean of the numbers for the old and the new chances. If
-        structure repeats, neighbours of outliers agree too. The new number alone could end a search too early.
+        structures repeat, outliers also have common neighbours. The new number alone could then end a search too early.
         """
         if not len(at):
             return
@@ -276,7 +276,7 @@ class Search:
         self._expect(problems[better & (self.samples.totals[problems] > stop)])
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
-        """Ascending losses (P, K) and entries (P, 12, K) of the best poses of the samples ``start`` to ``stop - 1``.
+        """Find the best poses of samples ``start`` to ``stop - 1``: ascending losses (P, K) and entries (P, 12, K).
 
         If a problem has many pairs, a few pairs score all poses first. More pairs then score the best poses. The number
         of pairs in the first scoring grows with ``start``, because inliers are rare if many samples had no success.
@@ -297,7 +297,7 @@ class Search:
         return self._compared(problems, scene, poses, valid)
 
     def _solved(self, problems: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Solve samples (P, H, s) of some problems. Returns poses (P, 12, S H), and which are solutions, (P, S H)."""
+        """Solve samples (P, H, s) of some problems. Returns poses (P, 12, S H), and which poses are valid, (P, S H)."""
         each = positions.shape[:2]
         rows = full_vectors((positions + problems[:, None, None] * self.pairs.shape[1]).flatten(0, 1))  # (R, s)
         values = self.pairs.flatten(0, 1).index_select(0, rows.flatten()).unflatten(0, rows.shape)
@@ -310,7 +310,7 @@ class Search:
         return poses.movedim(2, 0).flatten(2), valid.movedim(1, 0).flatten(1)
 
     def _compared(self, problems: Tensor, scene: Scene, poses: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Ascending losses (P, K) and entries (P, 12, K) of the best of poses (P, 12, W). Better rivals are stored."""
+        """Find the best of poses (P, 12, W): ascending losses (P, K), entries (P, 12, K). Also store better rivals."""
         if self.finds_rivals:
             loss, rival, _ = self._best_of(scene, poses, valid, 1, _WIDER)
             better = loss[:, 0] < self.rival_loss[problems]
@@ -382,7 +382,7 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
 
 
 def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
-    """Squared scale (B, 1) of a Cauchy kernel. The arguments are those of `median_residual`."""
+    """Squared scale (B, 1) of a Cauchy kernel. For the arguments, see `median_residual`."""
     median = median_residual(sq_residuals, there, fitted)  # median / (2 log 2) is the variance of a coordinate
     return CAUCHY**2 / (2.0 * math.log(2.0)) * median
 

@@ -38,11 +38,11 @@ _MOST = 8.0
 _LEAST_CONFIDENCE = 1e-3
 # Centre of the range of log(noise) that the network can estimate. The unit is the spread of the pixels or world points.
 _LOG_NOISE = -5.0
-# Least noise, divided by the spread. Scores divide by the variance of the noise, which must not be 0.
+# Least noise, divided by the spread. Scores divide by the variance, which must not be 0.
 _LEAST_NOISE = 1e-6
 # Least number of pairs for which the softmax is computed over rows. PyTorch 2.13 is slow for shorter rows.
 _SHORT = 16
-# This number is added to the attention score of padding.
+# This number is added to the attention scores of unusual pairs and of padding.
 _ABSENT = -1e9
 # Minimal samples, as ranks of the pairs in descending order of likelihood. The first six samples are a Turán system:
 # if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
@@ -50,7 +50,7 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 # For each entry (n, f), problems of at least n pairs also use the samples above with all ranks multiplied by f. If the
 # likeliest pairs agree on an incorrect pose, the samples of larger ranks help.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
-# 25 further samples of the 25 likeliest pairs, for problems of at least 36 pairs. No two of the 25 share two pairs.
+# 25 further samples of the 25 likeliest pairs, for problems of at least 36 pairs. No two samples share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
 # Number of likeliest pairs that score each hypothesis.
@@ -61,8 +61,8 @@ _JUDGED = 50.0
 _LEAST_VOTE = 0.5
 # If the minimal samples have more slots for poses than this number, a CPU removes the empty slots before scoring.
 _MANY_SLOTS = 64
-# The noise of points is converted to pixels at the depth of the pose. Smaller depths are raised to this depth in units
-# of the normalised world.
+# The noise of points is converted to pixels at the depth of the pose. This number is the lower bound of the depth, in
+# units of the normalised world.
 _LEAST_DEPTH = 0.5
 # If `search_on` follows, the network sees at most this number of pairs, but the search uses all pairs. On real matches
 # and on random problems of up to 1000 pairs, limits of 32 to 96 pairs give the same success rate as no limit.
@@ -127,7 +127,7 @@ class _View:
             return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
         known = sigmas.isfinite()
-        # Unknown sigmas are NaN, and are replaced before the division, because `unit` would get the gradient NaN.
+        # Unknown sigmas are NaN. They are replaced before the division, because `unit` would get the gradient NaN.
         relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
         logs = torch.where(known, relative.clamp(min=_LEAST_NOISE).log() - _LOG_NOISE, 0.0)
         return torch.cat((logs, known.to(logs.dtype)), -1)
@@ -135,13 +135,13 @@ class _View:
 
 @torch.no_grad()
 def _repeats(problem: Problem) -> Tensor:
-    """Logarithms (B, N, 2) of two counts: the pairs that share the pixel of a pair, and those that share its point."""
+    """For each pair, the log of the number of pairs with the same pixel, and with the same world point, (B, N, 2)."""
     there = problem.usual_weights > 0
     return torch.stack([copies(x, there) for x in (problem.img_points, problem.world_points)], -1).log()
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:
-    """Rotation with first two rows closest to ``affine`` (B, 2, 3). Squared row lengths of affine are ``squares``."""
+    """Rotation whose first two rows are closest to ``affine`` (B, 2, 3). ``squares`` is ``affine.square().sum(-1)``."""
     p, q = affine.unbind(1)
     product = (p * q).sum(-1, keepdim=True)  # (B, 1)
     # The orthonormal rows closest to A = `affine` are S^-1/2 A, where S = A A^T. S^-1/2 is proportional to the adjugate
@@ -186,7 +186,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 
 
 def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
-    """How many pairs a problem needs to use each of S samples, and the 3 S ranks of the pairs of all samples."""
+    """For S samples: the least number of pairs of a problem that uses each sample, and the 3 S ranks of all samples."""
     every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if not search_follows:  # a search draws further samples
         every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
@@ -233,7 +233,7 @@ class _Block(nn.Module):
             self.out.bias.zero_()
 
     def forward(self, x: Tensor, absent: Tensor) -> Tensor:
-        """Map ``x`` (B * N, width) to a tensor of this shape. ``absent`` (B, N) is ``_ABSENT`` for padding, else 0."""
+        """Map ``x`` (B * N, width) to the same shape. ``absent`` (B, N) is added to the scores, see ``_ABSENT``."""
         (batch, count), width, heads = absent.shape, x.shape[1], self.heads
         y = self.norm(x)
         values, scores = self.look.weight.split((width, heads))
@@ -251,7 +251,7 @@ class _Block(nn.Module):
 def _attention(x: Tensor, weight: Tensor, absent: Tensor) -> Tensor:
     """Softmax over the pairs, (C, B, N). The C scores of a pair are linear in ``x`` (B * N, width).
 
-    For few pairs, the softmax is computed over columns, in a tenth of the time of the softmax over rows.
+    For few pairs, the softmax over columns takes a tenth of the time of the softmax over rows.
     """
     scores = torch.addmm(absent.view(1, -1), weight, x.mT).view(weight.shape[0], *absent.shape)
     if compiling() or scores.shape[-1] >= _SHORT or are_few(scores):

@@ -95,7 +95,7 @@ KERNELS: dict[str, RobustKernel] = {
     ),
     "truncated": RobustKernel(
         loss=lambda square, scale: torch.minimum(square, scale * scale),
-        # The zero term gives the scale a gradient of 0. Distributed training expects a gradient of every parameter.
+        # The zero term gives the scale a gradient of 0. Distributed training expects a gradient for every parameter.
         weight=lambda square, scale: (square < scale * scale).to(square.dtype) + 0.0 * scale,
         default=30.0,
     ),
@@ -106,11 +106,11 @@ class BoundedParameter(nn.Module):
     """Learned values: a sigmoid maps the raw parameter to ``[lower, upper]``, in log space if ``logarithmic``.
 
     Args:
-        initial: initial value of each entry, within the bounds. Training never changes a value at a bound.
+        initial: initial value of each entry, within the bounds. A value that starts at a bound never changes.
         size: number of entries.
         lower: lower bound.
         upper: upper bound.
-        logarithmic: interpolate between the logarithms of the bounds. Both bounds must then be positive.
+        logarithmic: interpolate between the logarithms of the bounds. If true, both bounds must be positive.
 
     Raises:
         BaseError: when ``lower`` is not less than ``upper``, or ``initial`` is not within the bounds.

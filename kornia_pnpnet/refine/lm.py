@@ -46,13 +46,13 @@ BACKWARDS = ("unroll", "implicit")
 _T = TypeVar("_T")
 
 # Upper bound of a residual in the cost, in focal lengths. Points behind the camera have this residual, so that no point
-# in front of the camera costs more than a point behind the camera.
+# in front of the camera costs more.
 _MAX_RESIDUAL = 2.0
 # With `reject_worse`, a step is rejected only if the cost rises by more than this number of units in the last place.
 _ROUNDING = 100.0
-# Estimated noise of the points is replaced by 0 only if the log-likelihood then rises by more than this number. With 0
-# instead of 2, success with nine pairs of the protocol falls by 1.4 to 2.7 percentage points, and the errors with 20
-# exact points fall from 1.14 to 1.07 times those of least squares. Always without the noise: 4.6 to 5.3, 1.04 times.
+# Estimated noise of points is replaced by 0 only if 0 raises the log-likelihood by more than this number. This rule
+# lowers success for nine pairs (protocol) by 1.4 to 2.7 percentage points, and errors for 20 exact points from 1.14 to
+# 1.07 times the errors of least squares. If 0 always replaces the noise, the numbers are 4.6 to 5.3 and 1.04.
 _EXPECTED = 2.0
 # Factors of the damping after a rejected step and after an accepted step (Marquardt 1963; only with `reject_worse`).
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.3
@@ -62,12 +62,12 @@ class Plan(NamedTuple):
     r"""The inputs of all iterations of a refinement. Weights and sigmas have the shape :math:`(B, N)`.
 
     Attributes:
-        problem: the problem with the caller's weights. The noise of the problem is known for every pair, or ``None``.
-        prior: weight of each pair in ``judge``, without the robust weight: the caller's weight if there are iterations
+        problem: the problem with the caller's weights. The problem's noise is ``None``, or known for every pair.
+        prior: weight of each pair in ``judge``, without the robust weight. The caller's weight if there are iterations
             by residual (see :class:`RobustWeightedLM`), else the product of the caller's and the initialiser's weight.
         guided: product of the caller's and the initialiser's weights, divided by the largest product of the problem.
-        by_residual: ``guided`` without iterations by residual, else ``prior`` over the mean of its positive entries.
-        state: the initial states, a batch of size :math:`S B`: the first states of all problems, then the second, ….
+        by_residual: ``prior`` divided by the mean of its positive entries; ``guided`` if no iteration is by residual.
+        state: the initial states in a batch of size :math:`S B`: all first states, then all second states, ….
         world_sigma: the caller's standard deviation of each point, 0 where unknown.
         votes: see :class:`~kornia_pnpnet.judge.evidence.Votes`.
         hyperparameters: three scalars for each iteration: the step, the damping, and the shape of the kernel.
@@ -114,8 +114,8 @@ class Refinement(NamedTuple):
     Attributes:
         state: the refined pose in the frame of the problem, and the refined camera.
         weights: the weight of each pair at the refined pose, shape :math:`(B, N)`.
-        cost: robust loss of the pairs and the priors, divided by the number of pairs, shape :math:`(B,)`.
-        ok: whether the pose is believed, see :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
+        cost: robust loss of pairs and priors, divided by the number of pairs of positive weight, shape :math:`(B,)`.
+        ok: whether the pose passes the tests of :meth:`RobustWeightedLM.forward`, bool, shape :math:`(B,)`.
         in_front: whether at least three pairs of positive weight are in front of the camera, bool, shape :math:`(B,)`.
         probability: see :func:`~kornia_pnpnet.judge.evidence.probability`, shape :math:`(B,)`.
         evidence: the evidence for the pose.
@@ -147,25 +147,25 @@ class RobustWeightedLM(Configured):
     whitened by the covariance) of its pixel at the previous estimate. Kernel scales are then in standard deviations.
 
     *Several poses.* The first 70 % of the iterations (rounded down) refine all poses of an initialiser. The kernel of
-    the last of these iterations then gives the cost of each pose. Later iterations refine the pose of lowest cost.
+    the last of these iterations gives the cost of each pose. Later iterations refine the pose of lowest cost.
 
     *By residual.* If ``by_residual`` is positive, the last ``by_residual`` iterations and the choice among poses
-    ignore the initialiser's weights, because residuals then separate inliers from outliers better. In these iterations,
-    a mixture of inliers and outliers (:mod:`kornia_pnpnet.judge.evidence`), fitted to residuals, replaces the kernel.
+    ignore the initialiser's weights, because late residuals separate inliers better than these weights. In these
+    iterations, a fitted mixture of inliers and outliers (:mod:`kornia_pnpnet.judge.evidence`) replaces the kernel.
 
     Args:
-        m: number of iterations. With 0, the pose of the lowest cost is judged without refinement.
+        m: number of iterations. If ``m`` is 0, the pose of the lowest cost is judged without refinement.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
         step: initial :math:`\gamma`, in [0, 2].
         damping: initial :math:`\lambda`, in [1e-8, 100].
-        robustness: initial shape of the kernel; ``None``: the classical value of the kernel. At 0, ``power`` is least
-            squares.
+        robustness: initial shape of the kernel; ``None``: the classical value of the kernel. The kernel ``power`` with
+            the shape 0 is least squares.
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.
         reject_worse: reject a step that raises the cost of its problem, and then multiply the damping by 10. The last
             ``by_residual`` iterations reject no step. Without rejection, iterations from a distant start can diverge.
-        by_residual: number of final iterations that ignore the initialiser's weights, at most the number of iterations
-            after the choice among several poses.
+        by_residual: number of final iterations that ignore the initialiser's weights. The limit is the number of
+            iterations after the choice among several poses.
         learnable: whether the hyperparameters are trained.
         backward: ``"unroll"`` differentiates all iterations. ``"implicit"`` applies the implicit function theorem to
             the last state, so that memory does not grow with ``m``. The implicit gradient is exact at a minimum. Step,
@@ -226,7 +226,7 @@ class RobustWeightedLM(Configured):
         return KERNELS[self.config["kernel"]]
 
     def hyperparameters(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Step, damping and kernel shape of each iteration, :math:`(\max(m, 1),)` each, with the dtype of ``like``."""
+        r"""Step, damping and robustness per iteration, shape :math:`(\max(m, 1),)` each, in the dtype of ``like``."""
         count = max(self.m, 1)
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
@@ -251,8 +251,8 @@ class RobustWeightedLM(Configured):
     def forward(self, problem: Problem, starts: Starts) -> Refinement:
         """Refine the poses of ``starts`` in the frame of the problem.
 
-        A pose is ``ok`` only if the equations of the last iteration could be solved, at least three pairs are in
-        front of the camera, and its :func:`~kornia_pnpnet.judge.evidence.probability` suffices.
+        A pose is ``ok`` only if the equations of the last iteration could be solved, at least three pairs of positive
+        weight are in front of the camera, and the :func:`~kornia_pnpnet.judge.evidence.probability` suffices.
         """
         plan, now = self.iterate(self.begin(problem, starts))
         return self.judge(plan, now)
@@ -266,7 +266,7 @@ class RobustWeightedLM(Configured):
             known = torch.stack(given[:2]).isfinite().any(-1).any(0)[:, None]
         problem = problems_last(problem._replace(noise=_complete_noise(problem, starts)))
         prior = problem.weights * problems_last(starts.weights)
-        # The division prevents underflow. Without terms, the divisor changes no step, and needs no gradient.
+        # The division prevents underflow. If there are no terms, the divisor changes no step and needs no gradient.
         guided = by_residual = relative(prior, prior if problem.terms else prior.detach())
         if self.by_residual:
             prior = problem.weights
@@ -293,7 +293,7 @@ class RobustWeightedLM(Configured):
             run: calls each part of the refinement, compiled or uncompiled.
 
         Returns:
-            The plan, with the noise that the iterations by residual used, and the last states.
+            The plan and the last states. The plan holds the noise that the iterations by residual used.
         """
         m = self.m if m is None else min(m, self.m)
         each = plan.hyperparameters[:m] + plan.hyperparameters[max(m - 1, 0) :][:1] * more
@@ -318,9 +318,9 @@ class RobustWeightedLM(Configured):
         return plan, now
 
     def by_residuals(self, plan: Plan, now: Progress, known: Tensor, step: Tensor, damping: Tensor) -> Progress:
-        r"""One iteration by residual: fit the mixture to the residuals, and take a step with the mixture's weights.
+        r"""Run one iteration by residual: fit the mixture to the residuals, and step with the mixture's weights.
 
-        If the noise of a problem is ``known``, bool :math:`(B, 1)`, the variance of the mixture does not change.
+        If the noise of a problem is ``known`` (bool :math:`(B, 1)`), the mixture keeps its variance.
         """
         assert now.mixture is not None
         problem = plan.problem._replace(weights=plan.by_residual)
@@ -335,7 +335,7 @@ class RobustWeightedLM(Configured):
     def judge(self, plan: Plan, now: Progress, found: Evidence | None = None, odds: Tensor | None = None) -> Refinement:
         """Judge the states of :meth:`iterate`. If ``found`` is ``None``, the evidence for the states is computed.
 
-        ``odds`` are log-odds of the poses against other poses, shape :math:`(B,)`; ``None``: there are no other poses.
+        ``odds``, shape :math:`(B,)`, are log-odds of the poses against other poses. ``None``: there are no other poses.
         """
         seen = at_pose(now.state, plan.problem, plan.votes)
         shape = per_problem(plan.hyperparameters[-1][2], plan.prior[:, :1])
@@ -353,7 +353,7 @@ class RobustWeightedLM(Configured):
         return Refinement(now.state, weights, cost, ok, in_front, chance, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
-        """Fit a mixture to the residuals. Set estimated noise of points to 0 if residuals are likelier without it."""
+        """Fit a mixture to the residuals. Set estimated noise of points to 0 if 0 makes the residuals likelier."""
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.covariances:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
@@ -367,7 +367,7 @@ class RobustWeightedLM(Configured):
         other = (second > first + _EXPECTED).long()
         index = torch.add(torch.arange(batch, device=other.device), other, alpha=batch)
         noise, mixture = taken((both, found.mixture), index)
-        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # strides as after an iteration: one compiled graph
+        mixture = map_tensors(lambda x: x[:, 0, None], mixture)  # strides as in later iterations: one compiled graph
         return plan._replace(problem=plan.problem._replace(noise=noise)), now._replace(mixture=mixture)
 
     def _iteration(self, problem: Problem, now: Progress, step: Tensor, damping: Tensor, shape: Tensor) -> Progress:
@@ -392,7 +392,7 @@ class RobustWeightedLM(Configured):
         projection = project(state, problem)
         sq_residual, precision = information(projection, problem)
         robust = self.kernel.weight(sq_residual, shape)
-        if problem.noise is None and problem.terms:  # without noise, sigma is one pixel of the caller
+        if problem.noise is None and problem.terms:  # sigma is one pixel of the caller
             robust = robust / problem.img_scale.square()[:, None]
         return projection, self._equations(projection, problem, robust, precision)
 
@@ -408,7 +408,7 @@ class RobustWeightedLM(Configured):
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
-        """For each problem, keep the state of lowest cost. ``rivals`` are the problems of all states in ``now``."""
+        """For each problem, keep the state of lowest cost. ``rivals`` holds the problem of each state in ``now``."""
         batch = prior.shape[0]
         projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
@@ -419,13 +419,13 @@ class RobustWeightedLM(Configured):
     def _cost(self, projection: Projection, problem: Problem, prior: Tensor, shape: Tensor) -> Tensor:
         """Robust loss of pairs and terms, divided by the number of pairs with a positive weight, shape (B,)."""
         sq_residual, precision = information(projection, problem)
-        # The bound in square pixels, times the mean precision of both coordinates, is the bound in variances.
+        # The mean precision of both coordinates converts the bound from square pixels to squared sigmas.
         most = (_MAX_RESIDUAL * projection.focal).square().reshape(-1, 1)
         most = most * (precision if isinstance(precision, Tensor) else 0.5 * (precision.uu + precision.vv))
         sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
         count = (problem.weights > 0).sum(-1).clamp(min=1)
         total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
-        unit = problem.img_scale.square() if problem.noise is None else 1.0  # without noise, sigma is a caller's pixel
+        unit = problem.img_scale.square() if problem.noise is None else 1.0  # `None`: sigma is one pixel of the caller
         for term in problem.terms:
             total = total + unit * term.loss(projection.state)
         return total / count
@@ -433,10 +433,10 @@ class RobustWeightedLM(Configured):
     def _with_gradient(self, plan: Plan, now: Progress, shape: Tensor) -> State:
         r"""Attach the gradient of the minimiser to a converged state, by the implicit function theorem.
 
-        At the minimum :math:`g = J^\top W r = 0`, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
+        At the minimum, :math:`g = J^\top W r` is 0, so that :math:`d\delta = -(\partial g / \partial \delta)^{-1} dg`.
         Each added Newton step has this gradient and the value 0. The second step makes second derivatives exact. If the
-        Newton matrix is not positive definite, the Gauss-Newton matrix replaces it. Covariances of points make the
-        Newton matrix slightly asymmetric, which the solver ignores. A third step removes most of this error.
+        Newton matrix is not positive definite, the Gauss-Newton matrix replaces it. Noise of points makes the Newton
+        matrix slightly asymmetric, which the solver ignores. With covariances, a third step removes most of this error.
         """
 
         def equations(problem: Problem, at: State, shape: Tensor) -> NormalEquations:
@@ -465,7 +465,7 @@ class RobustWeightedLM(Configured):
 
 
 def taken(tree: _T, index: Tensor) -> _T:
-    """Select problems from every tensor of a tree except scalars, in the memory layout of ``problems_last``."""
+    """Select problems from every tensor of a tree, except scalars. The result has the layout of ``problems_last``."""
 
     def select(x: Tensor) -> Tensor:
         if not x.ndim or are_few(x):
@@ -476,9 +476,9 @@ def taken(tree: _T, index: Tensor) -> _T:
 
 
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """Complete the noise of every pair: sigmas are the initialiser's, and covariances are the caller's.
+    """Complete the noise of every pair. The initialiser gives the sigmas, and the caller gives the covariances.
 
-    If the initialiser gave no noise, sigmas are the caller's, or 0 if unknown. Without any noise, return ``None``.
+    If the initialiser gives no noise, sigmas are from the caller, or 0 where unknown. Without noise, return ``None``.
     """
     given = starts.noise if problem.noise is None else problem.noise
     if given is None:

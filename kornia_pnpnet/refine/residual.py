@@ -46,8 +46,8 @@ __all__ = [
 
 #: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. Otherwise ``|x / z|`` is below 1000.
 MIN_DEPTH_RATIO = 1e-3
-# Largest change of the logarithm of the focal length, and of a coefficient of radial distortion, in one step. The
-# exponential of a larger change of the logarithm could overflow.
+# Largest change of the zoom (the logarithm of the focal length) and of a coefficient of radial distortion in one step.
+# The exponential of a larger change could overflow.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
 # Lower bound of the denominator 1 + tr(R) in `tangent`. At a half turn, 1 + tr(R) is 0.
 _LEAST_DENOMINATOR = 1e-4
@@ -70,7 +70,7 @@ class Projection(NamedTuple):
         state: the state.
         stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
             ``None``: there is no distortion.
-        slope: twice the derivative of :math:`d` by :math:`\rho^2`, shape :math:`(N, B)`; ``None``: no distortion.
+        slope: twice the derivative :math:`\partial d / \partial \rho^2`, shape :math:`(N, B)`; ``None``: no distortion.
     """
 
     residual: Tensor
@@ -96,7 +96,7 @@ class Projection(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    r"""A Gauss-Newton system before damping, with the Jacobian divided by the focal length.
+    r"""A Gauss-Newton system before damping. The Jacobian :math:`J` is divided by the focal length.
 
     Attributes:
         matrix: :math:`J^\top W J`, shape :math:`(6 + K, 6 + K, B)`.
@@ -209,9 +209,9 @@ def covariance_at(rotation: Tensor, p: Tensor, q: Tensor, scale: Tensor, noise: 
 def information(projection: Projection, problem: Problem) -> tuple[Tensor, Tensor | Symmetric2]:
     """Compute squared residuals (B, N) in the unit of the robust kernel, and the information of the pixels.
 
-    Without noise, squared residuals are in square pixels, and the information is the number 1 of shape (1, 1). With
-    noise, all sigmas must be known. The information is then the inverse covariance of each pixel if the noise has
-    covariances, else the inverse variance, (B, N). Squared residuals are weighted by the information.
+    If the noise is ``None``, squared residuals are in square pixels, and the information is a 1 of shape (1, 1).
+    Otherwise, all sigmas must be known. The information is the inverse covariance of each pixel if the noise has
+    covariances, else the inverse variance (B, N). Squared residuals are weighted by the information.
     """
     noise = problem.noise
     if noise is None:
@@ -231,10 +231,10 @@ def normal_equations(
     Args:
         projection: the problem projected at the state.
         problem: the problem.
-        weights: weight of each pair, :math:`(B, N)`, or its weight matrix, entries :math:`(B, N)`, in inverse square
+        weights: the weight :math:`(B, N)` or the weight matrix (entries :math:`(B, N)`) of each pair, in inverse square
             pixels. Points behind the camera have no effect.
-        relative: divide the weights of each problem by the largest weight, so that products of tiny weights do not
-            underflow. The divisor has no gradient.
+        relative: divide the weights of each problem by their largest value or trace, so that products of tiny weights
+            do not underflow. The divisor has no gradient.
     """
     unit, sq_inverse = None, projection.inv_depth * projection.inv_depth
     if relative:
@@ -249,8 +249,8 @@ def normal_equations(
 def _jacobian(projection: Projection, problem: Problem) -> Tensor:
     """The rows of the Jacobian for u and v, times z/f, shape (6 + K, 2, N, B).
 
-    A row is y × e for the rotation, and e for the translation, with y = R x. The vector e is z times the derivative of
-    p or q by the point in the frame of the pose. For one camera, the vectors e are (1, 0, -p) and (0, 1, -q).
+    A row holds y × e for the rotation and e for the translation, where y = R x. The vector e is z times the gradient
+    of p or q with respect to the point R x + t. Without a rig, the vectors e are (1, 0, -p) and (0, 1, -q).
     """
     plane = projection.plane
     if problem.rig is None:
@@ -298,7 +298,7 @@ def _entrywise_equations(
     weighted = [(_plus(_times(u, uu), _times(v, uv)), _plus(_times(u, uv), _times(v, vv))) for u, v in columns]
 
     def inner(a: _Column, b: _Column) -> Tensor:
-        """Inner product (B,) of two columns, over pairs and over u and v."""
+        """Inner product (B,) of two columns: the sum over u, v and all pairs."""
         (a_u, a_v), (b_u, b_v) = a, b
         if type(a_u) is type(a_v) is type(b_u) is type(b_v):
             return torch.addcmul(a_u * b_u, a_v, b_v).sum(0)
@@ -400,8 +400,8 @@ def moved(state: State, delta: Tensor) -> State:
     :math:`\mathrm{cay}(\omega) = (I - \tfrac12[\omega]_\times)^{-1}(I + \tfrac12[\omega]_\times)` agrees with the
     exponential map to second order, and needs no trigonometry. The rotation angle is :math:`2 \arctan(|\omega|/2)`.
 
-    The parameters of the camera change by :math:`c`. A larger focal length also moves the camera away, as in a dolly
-    zoom, so that the origin keeps its pixel and its scale.
+    The parameters of the camera change by :math:`c`, which is clipped. A larger focal length also moves the camera away
+    (a dolly zoom), so that the origin keeps its pixel and its scale.
     """
     turn, rotation = delta[:3, None], state.pose.rotation.permute(1, 2, 0)
     size = turn.square().sum(0) + 4.0
@@ -446,8 +446,8 @@ def tangent(rotation: Tensor) -> Tensor:
 def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
     r"""Angle between two rotations.
 
-    The arctangent is accurate for small angles, unlike the arccosine. The angle is not differentiable at 0: train with
-    :mod:`kornia_pnpnet.losses`.
+    The arctangent is accurate for small angles, unlike the arccosine. The angle is not differentiable at 0. For
+    training, use :mod:`kornia_pnpnet.losses`.
 
     Args:
         rotation_a: shape :math:`(*, 3, 3)`.

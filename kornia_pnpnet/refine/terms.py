@@ -47,12 +47,12 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
         world_down: direction of gravity in the world, of any non-zero length, shape :math:`(B, 3)`. :math:`B` stands
             for any number of leading dimensions, including none.
         cam_down: measured direction of gravity in the camera's axes (+z forward), of the same shape as ``world_down``.
-        sigma: standard deviation of the measured direction about each perpendicular axis, in radians, a number or
-            :math:`(B,)`.
+        sigma: standard deviation of the measured direction about each perpendicular axis, in radians. A number, or a
+            tensor of shape :math:`()` or :math:`(B,)`.
 
     Raises:
-        BaseError: when the directions are not :math:`(B, 3)`, or sigma is neither a positive number nor a tensor with
-            the shape above.
+        BaseError: when the directions are not :math:`(B, 3)`, or sigma is neither a positive number nor a tensor of
+            shape :math:`()` or :math:`(B,)`.
 
     Example:
         >>> down = torch.tensor([[0.0, 0.0, -1.0]])  # the world's z axis points up
@@ -86,7 +86,7 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
 
 
 def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> NormalEquations:
-    """Add a term, linearised at the same state, to the normal equations. The focal length is a scalar or (B,)."""
+    """Add a term to normal equations that are linearised at the same state. ``focal`` is a scalar or (B,)."""
     weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
     weight = linear.weight / (focal if equations.unit is None else equations.unit[:, 0] * focal)
     matrix = torch.bmm(weighted, linear.jacobian).permute(1, 2, 0) * (weight / focal)
@@ -95,7 +95,7 @@ def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> Norma
 
 
 class CameraTerm(NamedTuple):
-    """A prior of radial distortion and of an unknown focal length in the problem's pixels.
+    """A prior of an unknown focal length, in the problem's pixels, and of radial distortion.
 
     Attributes:
         expected: the focal length that the caller expects, in pixels, shape :math:`(B,)`.
@@ -115,7 +115,7 @@ class CameraTerm(NamedTuple):
         return self._replace(expected=self.expected * pixels, focal=self.focal * pixels)
 
     def linearise(self, state: State) -> Linear:
-        """The residual holds log f minus the expected log f, followed by the coefficients of radial distortion."""
+        """The residual holds log f minus the expected log f, and then the coefficients of radial distortion."""
         assert self.information is not None
         batch, count = state.camera.shape
         offset = (self.focal / self.expected).log()
@@ -130,7 +130,7 @@ class CameraTerm(NamedTuple):
         return (linear.information.diagonal(dim1=1, dim2=2) * linear.residual.square()).sum(1)
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """See :class:`~kornia_pnpnet.problem.Term`. A prior of the camera says nothing about a pose."""
+        """See :class:`~kornia_pnpnet.problem.Term`. A prior of the camera penalises no pose."""
         return torch.zeros_like(pose.translation[..., 0])
 
 
@@ -140,9 +140,9 @@ class PoseTerm(NamedTuple):
     Attributes:
         pose: the expected pose.
         information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
-        offset: the point of the caller's world that is the origin of the problem, in the unit of the problem, shape
-            :math:`(B, 3)`. Errors of the translation are measured at the origin of the caller's world.
-        free: the only axis in the camera frame about which the rotation is unknown, or 0, shape :math:`(B, 3)`.
+        offset: the position of the problem's origin in the caller's world, in the unit of the problem, shape
+            :math:`(B, 3)`. Translation errors are errors at the origin of the caller's world.
+        free: axis (camera frame) of unknown rotation; 0 unless exactly one such axis exists, :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
         rank: number of directions in which the prior has information, shape :math:`(B,)`.
     """
@@ -156,7 +156,7 @@ class PoseTerm(NamedTuple):
 
     @classmethod
     def of(cls, prior: PosePrior, centroid: Tensor, size: Tensor) -> tuple[PoseTerm, Tensor]:
-        """Express a prior in the frame of a problem, given the ``centroid`` and ``size`` of its ``Frame``.
+        """Express a prior in the frame of a problem, given ``centroid`` and ``size`` of the problem's ``Frame``.
 
         The second result tells which priors are usable, bool (B,). A prior is usable if its numbers are in range, and
         its information is positive semi-definite. The information of an unusable prior becomes 0.
@@ -183,12 +183,12 @@ class PoseTerm(NamedTuple):
         return cls(pose, information, offset, _open_axis(information[:, :3, :3]), sq_scale, rank), usable
 
     def errors(self, pose: Pose) -> tuple[Tensor, Tensor]:
-        """The tangent vector (B, 6) by which ``retract`` moves poses to the prior, and the squared Mahalanobis length.
+        """The tangent vector (B, 6) from a pose to the prior (see ``retract``), and the squared Mahalanobis length.
 
-        The vector contains no rotation about ``free``.
+        The vector has no rotation about ``free``. The translation is the error at the origin of the caller's world.
         """
         turn = self.pose.rotation @ pose.rotation.mT
-        # Rotate the prior's pose about the free axis until this pose is closest to the given pose.
+        # Rotate the prior's pose about the free axis, as close to the given pose as possible.
         free = self.free
         along = turn.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (turn @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(turn - turn.mT)).sum(-1)
@@ -216,19 +216,19 @@ class PoseTerm(NamedTuple):
         by_turn = torch.cat((-rows, -So3.hat(turned)), 1)
         by_shift = torch.cat((torch.zeros_like(rows), -eye.expand_as(rows)), 1)
         columns = [by_turn, by_shift]
-        if state.camera.shape[1]:  # a zoom moves the camera along its axis, see `moved`
+        if state.camera.shape[1]:  # a new focal length also moves the camera, see `moved`
             columns += [state.pose.translation[:, 2:, None] * by_shift[..., 2:]]
             columns += [torch.zeros_like(state.radial)[:, None].expand(-1, 6, -1)]
         return Linear(error, torch.cat(columns, 2), self.information, torch.exp(-self._ratio(square)))
 
     def loss(self, state: State) -> Tensor:
-        """Robust loss (Welsch) in squared standard deviations, at most the squared scale of the kernel, (B,)."""
+        """Welsch loss (B,) in squared standard deviations. The loss is at most ``sq_scale``."""
         square = self.errors(state.pose)[1]
         scale = torch.where(self.sq_scale.isinf(), 1.0, self.sq_scale)
         return torch.where(self.sq_scale.isinf(), square, -scale * torch.expm1(-self._ratio(square)))
 
     def _ratio(self, square: Tensor) -> Tensor:
-        """Squared errors over the squared scale, bounded to keep derivatives of the exponential finite."""
+        """Squared errors divided by the squared scale. A bound keeps derivatives of the exponential finite."""
         return torch.minimum(square, _LARGEST_RATIO * self.sq_scale) / self.sq_scale
 
     def disagreement(self, pose: Pose) -> Tensor:
@@ -255,8 +255,8 @@ def _open_axis(information: Tensor) -> Tensor:
 def _correlations(information: Tensor) -> tuple[Tensor, Tensor]:
     """Ascending eigenvalues (B, 6) after scaling to a unit diagonal, and whether each matrix is symmetric, (B,).
 
-    A row with a diagonal entry of 0 is scaled like the row of the largest diagonal entry with the same unit, so that
-    rounding errors in the row stay small. If all diagonal entries with the same unit are 0, their rows must be 0.
+    A row whose diagonal entry is 0 gets the scale of the largest diagonal entry with the same unit, so that rounding
+    errors stay small. If all diagonal entries with the same unit are 0, a non-zero row makes the prior unusable.
     """
     information = information.detach().double()
     diagonal = information.diagonal(dim1=1, dim2=2)

@@ -149,9 +149,9 @@ def fit(
         folder: folder of the run.
         fabric: a launched Lightning Fabric. ``None`` means one process on the CPU.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
-            only with the same ``identity`` and the same settings. Only ``settings.updates`` may grow. If it grows, the
-            learning rates and the ramp follow the schedule of the longer run.
-        data_workers: number of processes per training process that draw the next batches.
+            only with the same ``identity`` and the same settings, except that ``settings.updates`` may grow. In this
+            case, the learning rates and the ramp follow the schedule of the longer run.
+        data_workers: number of worker processes that draw the next batches for each training process.
         resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
 
@@ -198,7 +198,7 @@ def fit(
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
     part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
-    # Updates with refinement are much slower than earlier updates, so the progress bar restarts with the refinement.
+    # Updates with refinement are much slower than earlier updates, so the progress bar restarts when refinement starts.
     alone = min(settings.updates, math.ceil(settings.ramp[0] * settings.updates))
     phase = ("network alone", alone) if start < alone else (_REFINES, settings.updates)
     bar = tqdm(None, *phase, initial=start, disable=not progress or history is None, unit="update", smoothing=0.0)
@@ -207,7 +207,7 @@ def fit(
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
 
     def report(since: int, before: Mapping[str, float]) -> FitReport:
-        """Report the work after the update ``since``, at which the stages had taken ``before`` seconds."""
+        """Report the work after the update ``since``. Until then, the stages had taken ``before`` seconds."""
         clock.lap("rest")
         spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
         whole = sum(spent.values())
@@ -312,7 +312,7 @@ def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: fl
 
 
 def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) -> Path:
-    """Train a new PnP-Net for 9 pairs for about ``seconds``, and return the path of the learning curves (CSV).
+    """Train a new 9-pair PnP-Net for about ``seconds``, and return the path of the learning curves (CSV).
 
     The number of updates follows from a short measurement of the machine's speed. An earlier run in ``folder`` is
     replaced. Raise ``BaseError`` when ``seconds`` is not a positive number.

@@ -213,13 +213,13 @@ def load_run(path: str | Path) -> RunResults:
 
 
 def find_results(weights: str | Path) -> RunResults | None:
-    """Load the results of the run that trained some weights, or return ``None`` if there is no results file.
+    """Load the results of the run that trained the given weights. Return ``None`` if there is no results file.
 
     The file is in the folder of the weights. If this folder is named ``weights``, its parent folder is searched, too.
     For the argument and the errors see :func:`~kornia_pnpnet.pretrained.find_weights` and :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Beside any other folder, results can be unrelated.
+    # `train.py` writes weights into the folder `weights` of a run. Results beside any other folder can be unrelated.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)

@@ -17,7 +17,7 @@ _FIRST_RESULT = "update"
 
 
 class SweepTable(Callback):
-    """At the end of a sweep, print each run's speed, success, and those overrides that differ between the runs."""
+    """At the end of a sweep, print the speed and success of each run, and the overrides that differ between runs."""
 
     def on_multirun_end(self, config: Any, **_: Any) -> None:
         """Print the table, and the path of the summary that the runs have written into the sweep's folder."""
