@@ -30,7 +30,7 @@ __all__ = ["checked_inputs", "given_cameras", "in_parts", "restore_leading"]
 
 _T = TypeVar("_T")
 
-# Least number of rows, padding included, that a problem keeps when `in_parts` removes padding.
+# `in_parts` removes padding only down to this number of rows (pairs and padding) per problem.
 _LEAST_PAIRS = 16
 
 
@@ -166,7 +166,7 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, like: Tensor) -> Tensor:
-    """Return a rig's camera matrices, one for each problem or each pair, scaled so that the last entry is 1."""
+    """Return the cameras of a rig, for each problem or for each pair. Matrices are scaled to a last entry of 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = _cameras(intrinsics, size).to(like.dtype)
@@ -175,7 +175,7 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, l
 
 
 def _cameras(intrinsics: Tensor | PinholeCamera, size: torch.Size) -> Tensor:
-    """Return camera matrices. The batch dimension of Kornia's cameras is split into the leading dimensions."""
+    """Return camera matrices. The batch dimension of Kornia's cameras is split into the dimensions ``size``."""
     matrices = camera_matrices(intrinsics)
     one_batch = isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3 and len(matrices) == size.numel()
     return matrices.reshape(*size, 3, 3) if one_batch else matrices
@@ -185,8 +185,8 @@ def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | N
     """Solve a batch. On a CPU, split the batch into parts that fit the caches, and solve one part after the other.
 
     A part has about ``most`` pairs for each CPU thread. The size of a part has no limit if ``most`` is ``None`` or
-    gradients are recorded. If ``any_number`` is true, ``solve`` accepts any number of pairs. Problems with a mask are
-    then grouped by their number of pairs. If these numbers differ strongly, grouping saves a third to half of the time.
+    gradients are recorded. If ``any_number`` is true (``solve`` accepts any number of pairs), problems with a mask are
+    grouped by number of pairs. If the numbers of pairs differ strongly, grouping saves a third to half of the time.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:

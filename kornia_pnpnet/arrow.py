@@ -1,4 +1,4 @@
-"""Solve tables of problems in Apache Arrow's format, for example from Ray Data."""
+"""Solve tables of problems. The tables have Apache Arrow's format and come, for example, from Ray Data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ with needs("shards", "tables need pyarrow"):
 
 __all__ = ["INPUTS", "OUTPUTS", "Solve", "list_column"]
 
-_PAIRS = -1  # in a shape, stands for the number of pairs
+_PAIRS = -1  # placeholder in shapes for the number of pairs
 _SHAPES: dict[str, tuple[int, ...]] = {"world_points": (_PAIRS, 3), "img_points": (_PAIRS, 2), "intrinsics": (3, 3)}
 _SHAPES |= dict.fromkeys(("weights", "img_sigma", "world_sigma"), (_PAIRS,))
 #: Columns that :class:`Solve` reads.
@@ -48,7 +48,7 @@ class Solve:
     all pairs. NaN means an unknown sigma.
 
     The result has the columns ``rotation`` (9), ``translation`` (3), ``weights`` (N), ``cost``, ``ok``, and ``status``
-    (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). Rows keep their order, and other columns of the
+    (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). Rows keep their order. Other columns of the
     table, for example ``id``, are kept. Numbers are float32.
 
     A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. The status of a row is
@@ -129,7 +129,7 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """A column. List i is ``values[starts[i] : starts[i] + sizes[i]]``. Null numbers are NaN, null lists are empty."""
+    """A column. List i is ``values[starts[i] : starts[i] + sizes[i]]``. Null numbers are NaN. Null lists are empty."""
 
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
         array = column.combine_chunks()
@@ -157,7 +157,7 @@ class _Cells:
 
 
 def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield the rows of each call of the solver, and the number of pairs to which the rows are padded.
+    """For each call of the solver, yield the rows and the number of pairs to which the rows are padded.
 
     Problems of 16 or more pairs are padded by less than a quarter, to the next size in 16, 20, 24, 28, 32, 40, 48, ...
     """

@@ -1,7 +1,7 @@
 """Undistort pixels, convert pixels to bearings, make cameras that look along bearings, and project points.
 
 The *undistorted point* of a pixel lies on the pixel's ray and on the plane z = 1. Rays of a fisheye can miss the plane.
-For a fisheye, the point is therefore the unit vector along the ray's (x, y), times the angle from the optical axis.
+For a fisheye, the point therefore has the direction of the ray's (x, y). Its norm is the angle from the optical axis.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def undistort(
     Returns:
         The undistorted pixels; whether each pixel has a solution, bool :math:`(B, N)`; and the noise of the undistorted
         pixels. A pixel has no solution if it is outside the range of the polynomial, if it is more than 85 degrees off
-        the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point replaces such a
-        pixel. Each sigma is multiplied by the root mean square singular value of the undistortion's Jacobian.
+        the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point replaces a pixel
+        without a solution. Sigmas are multiplied by the Frobenius norm of the undistortion's Jacobian, divided by √2.
     """
     check_form(["B", "N", "2"], img_points=img_points)
     camera, _ = pinholes(intrinsics)
@@ -130,7 +130,7 @@ def bearings(
         bearing of a pixel that cannot be undistorted is NaN and has no gradient.
 
     Raises:
-        ShapeError: when a shape is not as above, or when no lens model has the given number of coefficients.
+        ShapeError: when a shape is not as documented, or when no lens model has the given number of coefficients.
         ValueCheckError: when both ``dist`` and ``fisheye`` are given.
         BaseError: for tensors on different devices, and for booleans or complex numbers.
 
@@ -218,13 +218,13 @@ def looking_along(inputs: Inputs) -> Inputs:
 
 
 def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale camera matrices (*, 3, 3) by :func:`~kornia_pnpnet.frame.scaled_cameras`, and tell which ones are valid."""
+    """Scale camera matrices (*, 3, 3), and tell which are valid, see :func:`~kornia_pnpnet.frame.scaled_cameras`."""
     entries, sound = scaled_cameras(intrinsics.flatten(-2).movedim(-1, 0))
     return entries.movedim(0, -1).unflatten(-1, (3, 3)), sound
 
 
 def focal_length(camera: Tensor) -> Tensor:
-    """Return the geometric mean of the absolute fx and fy for valid camera matrices (*, 3, 3), shape (*)."""
+    """Return the geometric mean of |fx| and |fy|, shape (*), for valid camera matrices (*, 3, 3)."""
     return (camera[..., 0, 0] * camera[..., 1, 1]).abs().sqrt()
 
 
@@ -239,7 +239,7 @@ def reproject(world_points: Tensor, intrinsics: Tensor, pose: Pose) -> Tensor:
 def _through(
     dist: Tensor | None, fisheye: Tensor | None, img_points: Tensor, intrinsics: Tensor
 ) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-    """Return undistorted points (B, N, 2), whether each pixel has such a point, bool (B, N), and the lens function."""
+    """Return undistorted points (B, N, 2), a mask (B, N) of the points that exist, and the lens function."""
     camera, sound = pinholes(intrinsics)
     coefficients = fisheye if dist is None else dist
     if coefficients is not None:
@@ -281,7 +281,7 @@ def _flatten(point: Tensor) -> Tensor:
 
 def _invert(lens: Callable[[Tensor], Tensor], target: Tensor) -> tuple[Tensor, Tensor]:
     """Find the points (B, N, 2) that a lens maps to ``target``, and tell which points exist. A missing point is 0."""
-    # A Newton step is at most about half the distance of the target from the centre. Two steps after the loop let
+    # A Newton step is at most about half the distance of the target from the centre. After the loop, two steps let
     # gradients flow to the target and the coefficients. The second of these steps makes second derivatives exact.
     with torch.no_grad():
         point = target

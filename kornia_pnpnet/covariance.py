@@ -27,7 +27,7 @@ _LEAST_EIGENVALUE = 1e-13
 # The given focal length may differ by at most this factor from the focal length that fits the pixels at the pose. A
 # larger factor shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
 _FOCAL_RATIO = 1.5
-# Shares of pixel noise in the mean variance of a pixel, tried by `shown_noise`. The rest is due to the points' noise.
+# `shown_noise` tries these shares of pixel noise in the mean variance of a pixel. The points' noise causes the rest.
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
@@ -72,18 +72,18 @@ def pose_covariance(
         prior: the prior of the solver's call. The prior's information is added to the information of the pairs.
         focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
             ``intrinsics`` of the result, not the ``intrinsics`` of the solver's call.
-        focal_sigma: the solver's ``focal_sigma``. This prior's information is added to the information of the pairs.
+        focal_sigma: the solver's ``focal_sigma``, a prior whose information is added to the information of the pairs.
 
     Returns:
         The covariance in radians and the unit of the world, shape :math:`(B, 6, 6)`, with the dtype of a solver's
         result. With an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the
         logarithm of the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the
-        diagonal is infinite and all other entries are 0. The same holds if ``focal`` is ``"unknown"`` and the given
-        focal length differs by more than a factor of 1.5 from the focal length that fits the pixels at the pose.
+        diagonal is infinite and all other entries are 0. With ``focal="unknown"``, the diagonal is also infinite if
+        the given focal length differs by more than a factor of 1.5 from the one that fits the pixels at the pose.
 
     Raises:
-        BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` has another value,
-            or if ``focal_sigma`` is given with a known focal length.
+        BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` is neither
+            ``"known"`` nor ``"unknown"``, or if ``focal_sigma`` is given for a known focal length.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -164,7 +164,7 @@ def shown_noise(
     """Estimate the noise of pixels and points from the residuals at a pose.
 
     At a larger depth, the noise of a point moves the point's pixel less. The noise of a pixel does not depend on the
-    depth. Of five mixtures of pixel noise and point noise, the mixture with the largest Gaussian likelihood is used.
+    depth. Five mixtures of pixel noise and point noise are tried. The largest Gaussian likelihood selects one of them.
 
     See :func:`pose_covariance` for the arguments. The returned dict has ``img_sigma`` and ``world_sigma``, shape (B,).
     """
@@ -174,7 +174,7 @@ def shown_noise(
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
-    # Variances of the pixels if the noise of the points has the standard deviation 1, and the pixels are exact.
+    # Variance of each pixel if only the points have noise, with the standard deviation 1.
     of_points = pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
     mean = (weights * of_points).sum(1) / total
     share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)

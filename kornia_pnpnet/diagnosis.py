@@ -39,7 +39,7 @@ class Diagnosis(NamedTuple):
     """The result of :func:`diagnose`. The ``str`` of the result is one sentence."""
 
     trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
-    #: The equally good ``ok`` trials. If any of these leaves the pairs unchanged, only the first such trial is kept.
+    #: The ``ok`` trials with about the largest evidence, or only the first that leaves the pairs unchanged (if any).
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:

@@ -79,7 +79,7 @@ OUTPUTS = ExportedResult._fields
 _MAX_BATCH, _MAX_N = 2**20, 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
-# `_MODEL` names the only model unless `n` is a sequence. `_MODELS` is the folder of all models in a package.
+# If `n` is not a sequence, `_MODEL` is the name of the only model. `_MODELS` is a package's folder of models.
 _MODEL, _MODELS = "model", "/data/aotinductor/"
 
 
@@ -114,11 +114,11 @@ def export_program(
     Returns:
         A program that maps :data:`INPUTS` to the fields of :class:`ExportedResult`, or of :class:`ExportedCamera` if
         the focal length is unknown. Inputs have the shapes of ``PnPNet.forward``. Padding needs the weight 0. A program
-        for rigs takes :data:`RIG_INPUTS`. Then ``intrinsics`` has a matrix for each pair, :math:`(B, N, 3, 3)`.
+        for rigs takes :data:`RIG_INPUTS`. For rigs, ``intrinsics`` has a matrix for each pair, :math:`(B, N, 3, 3)`.
 
     Raises:
-        BaseError: when ``n`` is less than 3 or not the number that the network was built for, or when ``batch`` is less
-            than 1 or more than 1 048 576.
+        BaseError: when ``n`` is less than 3 or not the network's number of pairs, or when ``batch`` is less than 1 or
+            more than 1 048 576.
         ValueCheckError: when the solver cannot be traced, or when a solver for rigs has an unknown focal length or no
             initialiser.
 
@@ -195,14 +195,14 @@ def export_package(
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
     :func:`load_package` loads the package without tracing or compiling. C++ programs need only libtorch to load a
-    package. A package runs on one thread. A package needs the PyTorch version of the compiling machine, and a CPU that
-    has all instruction sets (for example AVX-512) of the compiling machine. Compiling takes minutes. An existing file
-    is replaced only when the package is complete.
+    package. A package runs on one thread. A package needs the compiling machine's PyTorch version, and a CPU that has
+    all of this machine's instruction sets (for example AVX-512). Compiling takes minutes. An existing file is replaced
+    only when the package is complete.
 
     With ``batch=1`` and a fixed number of pairs, one problem takes a fraction of the time of a general package. If
     PyTorch's own loader runs this faster package, each call overwrites the previous result of the same thread.
 
-    If ``n`` is a sequence of numbers, such as ``(16, 64, 256)``, the package holds a model for each number, and each
+    If ``n`` is a sequence of numbers, such as ``(16, 64, 256)``, the package holds a model for each number. Each
     problem is padded to the next of these numbers. C++ programs choose a model by name: the model for 16 pairs is
     "n16". If ``n`` is a single number or ``None``, the only model is "model".
 

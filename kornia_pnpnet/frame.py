@@ -21,7 +21,7 @@ __all__ = ["F_CONST", "Frame", "Normalize", "scaled_cameras"]
 
 #: Focal length of the normalised camera in pixels. (Cameras of ETH3D have focal lengths of 3400 to 3430.)
 F_CONST = 3400.0
-# Limit of the entries of given poses. Fourth powers of entries must be finite in float32, the dtype of the networks.
+# Limit of the entries of given poses. Fourth powers of entries must be finite in float32, because networks use float32.
 _LARGEST_ENTRY = torch.finfo(torch.float32).max ** 0.25
 # Centre and scale ignore points that are farther than `_FAR` typical distances (see `Normalize`) from the median. For
 # fewer than `_MANY` pairs, the limit is `_FAR_OF_FEW`, because the typical distance of few points is inaccurate.
@@ -30,7 +30,7 @@ _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
 _LARGEST_DISTANCE = 1e6
 # A confidence may be outside [0, 1] by less than this number, because cosines of descriptors have rounding errors.
 _ROUNDING = 1e-3
-# Tangent of 85 degrees. A real lens that is free of distortion does not see rays at larger angles to the axis.
+# Tangent of 85 degrees. A real lens without distortion does not see rays that are more than 85 degrees off the axis.
 _FAR_ANGLE = 11.4
 
 
@@ -40,8 +40,8 @@ class Frame(NamedTuple):
     Attributes:
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
-        img_scale: number of pixels of the problem per pixel of the caller (geometric mean of the absolute scales of u
-            and v), shape :math:`(B,)`. In a rig, the number is the mean over the pairs.
+        img_scale: factor from the caller's pixels to the problem's pixels (geometric mean of the absolute factors of u
+            and v), shape :math:`(B,)`. In a rig, the factor is the mean over the pairs.
         order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices, scaled to a last entry of 1, shape :math:`(B, 3, 3)`, or :math:`(B, N, 3, 3)`
@@ -78,7 +78,7 @@ class Frame(NamedTuple):
         return Pose(pose.rotation, pose.translation * self.size.view(-1, *more, 1) - offset)
 
     def undo_pairs(self, values: Tensor) -> Tensor:
-        """Sort values of pairs, :math:`(B, N)`, back to the caller's order."""
+        """Put values :math:`(B, N)` of pairs back into the caller's order."""
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
     def undo_starts(self, starts: Starts) -> Starts:
@@ -105,7 +105,7 @@ class Normalize(Configured):
     Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0.
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
-    with or without skew). At least three of its pairs have a positive weight. Its points deviate from any line by more
+    with or without skew). At least three pairs have a positive weight. The points deviate from any line by more
     than the rounding errors of the coordinates. Zeros replace the inputs of invalid problems, so that all later values
     and gradients are finite. A pair with the weight 0 is padding. The coordinates of padding are ignored.
 
@@ -165,7 +165,7 @@ class Normalize(Configured):
             weights: at least 0, shape :math:`(B, N)`; 1 when ``None``.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`.
             noise: noise of each pair, in pixels and in the unit of the world.
-            confidence: see :class:`~kornia_pnpnet.problem.Problem`. Pairs whose value is outside [0, 1] are left out.
+            confidence: see :class:`~kornia_pnpnet.problem.Problem`. Pairs with a value outside [0, 1] are left out.
             rig: see :class:`~kornia_pnpnet.problem.Problem`.
         """
         (batch, count), left_out = world_points.shape[:2], None
@@ -204,7 +204,7 @@ class Normalize(Configured):
         if rig is not None:
             is_camera = (is_camera | ~given).all(0)
         there = given & (is_camera & is_finite) & (sizes[3:5].amax(0) < limit)
-        # A pair loses its weight if its distance or angle is impossible. The problem stays valid.
+        # A pair loses its weight if its distance or angle is too large. The problem stays valid.
         distance, typical = _distances(rows[:3].detach(), there, padded)
         there = there & (distance <= _LARGEST_DISTANCE * typical)
         rows = torch.where(there, rows, zero)  # all numbers are finite now, also in the unit of the typical distance
@@ -217,7 +217,7 @@ class Normalize(Configured):
         number = there.sum(0)
         far = torch.where(number < _MANY, typical.new_full((), _FAR_OF_FEW), _FAR) * typical
         seen = there & (off_axis <= self.f_const * _FAR_ANGLE)
-        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # few seen pairs: keep wide angles
+        usual = (seen | (there & (seen.sum(0) <= MIN_PAIRS))) & (distance <= far)  # keep all angles if few are seen
         is_usual = usual.to(rows.dtype)
 
         # Compute centre and scale from the usual points. Before squaring, coordinates are divided by the largest one.
@@ -301,8 +301,8 @@ class Normalize(Configured):
 def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:
     """Scale camera matrices (9, ...) to a last entry of 1, and tell which matrices are valid.
 
-    A valid matrix has zeros below its diagonal and focal lengths that are not 0. Its entries, the inverses of its focal
-    lengths, and the inverse of its last entry have finite fourth powers. The identity replaces an invalid matrix.
+    A valid matrix is upper triangular, and its focal lengths are not 0. Fourth powers of the entries, of the inverse
+    focal lengths and of the inverse last entry are finite. The identity replaces an invalid matrix.
     """
     limit = torch.finfo(camera.dtype).max ** 0.25
     entries = camera.detach()

@@ -1,4 +1,4 @@
-"""The negative log-likelihood of the true pose, a loss for training points, pixels and their noise."""
+"""A loss that trains points, pixels and their noise: the negative log-likelihood of the true pose."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _PRIOR_TRANSLATION = 0.5
 _WIDEST_ROTATION = 1.0
 # Iterations and damping of the refinement that finds a mode.
 _MODE_ITERATIONS, _MODE_DAMPING = 4, 1e-3
-# Least depth of a point, divided by the points' distance. Smaller depths are raised to this bound and penalised.
+# Least depth of a point, divided by the points' distance from the camera. Smaller depths are raised and penalised.
 _LEAST_DEPTH = 0.02
 
 
@@ -64,7 +64,7 @@ def monte_carlo_pose_loss(
     :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted sum of the pairs' robust losses.
     Residuals are in standard deviations. If world points have noise, the cost includes the logarithm of each pixel's
     variance. In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the true
-    translation. The scale of this distribution is half the distance between camera and points. Importance sampling
+    translation. The scale of this t distribution is half the distance between camera and points. Importance sampling
     estimates the constant :math:`Z`.
 
     The same number of samples is drawn from each component of a mixture. The components are the prior and several t
@@ -230,7 +230,7 @@ class _Posterior(NamedTuple):
     prior: _Prior
     refine: RobustWeightedLM  # finds modes; its robust kernel is also the kernel of the density
     shape: Tensor  # the kernel's scale or exponent, a scalar
-    noisy_points: bool  # whether world points have noise, so that the variance of a pixel depends on the pose
+    noisy_points: bool  # whether world points have noise; if so, the variance of a pixel depends on the pose
 
     def log_density(self, poses: Pose) -> Tensor:
         """Logarithm of the product of likelihood and prior, (S, B), for poses (S, B, 3, 3) and (S, B, 3)."""
@@ -275,7 +275,7 @@ class _Posterior(NamedTuple):
         return _Component(pose, torch.linalg.cholesky_ex(scaled)[0] / scale[..., None])
 
     def mode(self, poses: Pose, log_weights: Tensor) -> Pose:
-        """Refine the pose with the largest importance weight to a mode."""
+        """Find a mode by refining the pose that has the largest importance weight."""
         best = log_weights.argmax(0)
         pose = map_tensors(lambda x: x[best, torch.arange(len(best), device=best.device)], poses)
         starts = Starts(pose, torch.ones_like(self.problem.weights))

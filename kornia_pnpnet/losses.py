@@ -28,7 +28,7 @@ __all__ = ["LossTerms", "PoseLoss", "SetLoss", "pose_distances"]
 
 # Probabilities in the cross entropy are at least this number, so that the loss of a single pair is bounded.
 _LEAST_PROBABILITY = 1e-3
-# Squared residuals, as multiples of the variance, are clipped to this value, because larger residuals are not noise.
+# Squared residuals are clipped to this multiple of the variance, because larger residuals are not noise.
 _MOST_VARIANCES = 20.0
 
 
@@ -57,7 +57,7 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
         :math:`\theta`, and the translation distance :math:`\|\hat t - t\|`, each :math:`(B,)`.
 
     Raises:
-        BaseError: when shapes are not as above, or dtypes or devices differ.
+        BaseError: when shapes are not as documented, or dtypes or devices differ.
 
     Example:
         >>> eye = Pose(torch.eye(3)[None], torch.zeros(1, 3))

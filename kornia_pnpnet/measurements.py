@@ -38,10 +38,10 @@ def heatmap_keypoints(
 
     The softmax of a map is a density that is constant in each cell. The mean of this density is Kornia's soft-argmax.
     The variance of a cell, 1/12 per axis, is added to the covariance of the cells' centres (Sheppard's correction). The
-    sum is positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
+    result is positive definite. :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss` can train the covariance.
 
     Convention:
-        Pixels are (u, v) with the centre of the top-left pixel at (0, 0), as in Kornia. Add 0.5 to the pixels if the
+        Pixels are (u, v), and the centre of the top-left pixel is (0, 0), as in Kornia. Add 0.5 to the pixels if the
         camera's principal point is measured from the corner of the image.
 
     Source: A. Nibali et al., "Numerical Coordinate Regression with Convolutional Neural Networks", 2018 (DSNT).
@@ -126,8 +126,8 @@ def depth_points(
     Returns:
         A solver's ``world_points``, shape :math:`(B, N, 3)`, and ``world_cov`` in squared units of the world, shape
         :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its sigma is negative, or
-        its camera or pose is invalid. The same holds if one of its numbers is not finite, or is so large that its
-        fourth power overflows. Exclude such a pair with the solver's ``mask``; otherwise its problem is not ``ok``.
+        its camera or pose is invalid. A pair also gets NaN if the fourth power of any of its numbers is not finite.
+        The solver's ``mask`` must exclude pairs with NaN; otherwise their problem is not ``ok``.
 
     Raises:
         BaseError: for tensors whose shapes or devices do not match, tensors of booleans or complex numbers, a sigma
@@ -181,7 +181,7 @@ def depth_points(
     if img_cov is not None:
         noise = torch.where(sound[..., None, None], img_cov.to(dtype), eye[:2, :2])
 
-    # The coordinates of rays are in the world's axes. Kornia's unprojection is not used, because it ignores the skew.
+    # Rays are expressed in the world's axes. Kornia's unprojection is not used, because it ignores the skew.
     back = rotation.mT @ torch.linalg.inv_ex(camera).inverse  # (B, 3, 3)
     rays = convert_points_to_homogeneous(pixels) @ back.mT  # (B, N, 3)
     points = depth[..., None] * rays - translation[..., None, :] @ rotation

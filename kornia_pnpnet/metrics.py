@@ -93,7 +93,7 @@ def pose_errors(estimate: Pose, truth: Pose) -> PoseErrors:
     r"""Compute pose errors. Rotations have the shape :math:`(B, 3, 3)`, and translations :math:`(B, 3)`.
 
     Raises:
-        BaseError: when shapes are not as above, or shapes, dtypes or devices of the poses differ.
+        BaseError: when shapes are not as documented, or shapes, dtypes or devices of the poses differ.
 
     Example:
         >>> truth = Pose(torch.eye(3)[None], torch.zeros(1, 3))
@@ -115,7 +115,7 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         max_translation: limit of the translation error in the unit of the world, a number or :math:`(B,)`.
 
     Raises:
-        BaseError: when tensors are on different devices, or when a shape is not as above.
+        BaseError: when tensors are on different devices, or when a shape is not as documented.
 
     Example:
         >>> success(PoseErrors(torch.tensor([0.5, 0.5, 2.0]), torch.tensor([0.1, 0.3, 0.1])))

@@ -1,4 +1,4 @@
-"""Peers give solvers of other libraries the call signature of PnPNet, to compare solvers on the same problems.
+"""A peer wraps another library's solver in the call signature of PnPNet, to compare solvers on the same problems.
 
 The constructor of a peer imports the library.
 """
@@ -27,7 +27,7 @@ from kornia_pnpnet.result import Alternatives, PnPResult, Pose, Status
 
 __all__ = ["KorniaRs", "OpenCVPnP", "OpenCVRansac", "OpenCVUsac", "PeerPose", "PeerSolver", "PoseLib", "PyColmap"]
 
-# Rows and columns, in a camera matrix, of the ``PINHOLE`` parameters fx, fy, cx and cy of COLMAP and PoseLib.
+# Rows and columns of fx, fy, cx and cy (``PINHOLE`` parameters of COLMAP and PoseLib) in a camera matrix.
 _PINHOLE = (0, 1, 0, 1), (0, 1, 2, 2)
 
 
@@ -46,8 +46,8 @@ class PeerSolver(nn.Module):
 
     A subclass implements :meth:`solve_one`, and is a dataclass whose fields are the arguments of the constructor. The
     library gets the pairs of positive weight that are not padding, but gets no weights. If no pose is found, ``ok`` is
-    false, and the pose is the identity. A problem is not solved if it has fewer than three such pairs, a negative
-    weight, a value that is not finite, or an invalid camera, for example with skew or a focal length of 0.
+    false, and the pose is the identity. A problem is not solved if the library would get fewer than three pairs, if a
+    weight is negative, if a value is not finite, or if the camera has skew, a focal length of 0 or another fault.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
@@ -241,7 +241,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
     Args:
         threshold: largest reprojection error, in pixels, of an inlier.
         iterations: largest number of RANSAC iterations.
-        confidence: number in (0, 1). RANSAC stops when a sample without outliers was drawn with this probability.
+        confidence: number in (0, 1). RANSAC stops once the probability of a sample without outliers is this high.
         method: OpenCV's name of the solver for minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
         refine: whether to minimise the inliers' squared reprojection errors, starting from RANSAC's pose. The field
             ``init`` of the result is the pose before this refinement.
@@ -279,7 +279,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
 
 @dataclass(eq=False, kw_only=True)
 class OpenCVUsac(OpenCVRansac):
-    r"""A USAC variant of OpenCV's ``solvePnPRansac``, which includes a refinement. See :class:`OpenCVRansac`.
+    r"""A USAC variant of OpenCV's ``solvePnPRansac``. USAC includes a refinement. See :class:`OpenCVRansac`.
 
     Args:
         method: OpenCV's name of the variant. ``USAC_PROSAC`` expects the pairs sorted from the best to the worst.
@@ -295,8 +295,8 @@ class OpenCVUsac(OpenCVRansac):
 class KorniaRs(RobustPeer):
     r"""``solve_pnp_ransac`` of kornia-rs, problem by problem: RANSAC with P3P, then least squares on the inliers.
 
-    kornia-rs computes in float32. Its local optimisation is off, because local optimisation does not increase the
-    number of solved ``SyntheticProblems``. For ``threshold``, ``confidence``, ``seed`` and the tuning of the default
+    kornia-rs computes in float32. Local optimisation is off, because it does not increase the number of solved
+    ``SyntheticProblems``. For ``threshold``, ``confidence``, ``seed`` and the tuning of the default
     threshold, see :class:`OpenCVRansac`.
 
     Args:

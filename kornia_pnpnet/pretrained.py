@@ -74,7 +74,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     for name, tensor in state.items():
         if not tensor.isfinite().all():
             raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
-    # Refuse integers that exceed the largest size of a tensor, before a module of such a size is built.
+    # Refuse integers above the largest dimension of the saved tensors, before a module of such a size is built.
     largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
     entries = [("", config)]
     while entries:
@@ -118,7 +118,7 @@ _INITIALISERS: dict[str, type[nn.Module]] = {x.__name__: x for x in (EPnP, MLPIn
 
 
 class PretrainedMixin(nn.Module):
-    """The base class of :class:`~kornia_pnpnet.PnPNet`, which saves, loads and copies solvers."""
+    """This base class of :class:`~kornia_pnpnet.PnPNet` saves, loads and copies solvers."""
 
     init: nn.Module | None
     refine: RobustWeightedLM
@@ -140,7 +140,7 @@ class PretrainedMixin(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
-        """Copy the solver with another refinement or other options. The copy and the solver share unchanged modules."""
+        """Copy the solver, and replace the refinement or options. The copy and the solver share unchanged modules."""
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:

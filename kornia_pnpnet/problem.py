@@ -135,7 +135,7 @@ class Term(Protocol):
         """Robust loss in squared standard deviations, shape (B,)."""
 
     def disagreement(self, pose: Pose) -> Tensor:
-        """Penalty that searches add to the loss of a pose that differs from the prior. The unit is an outlier's loss.
+        """Penalty for a pose's difference from the prior, added to the loss in searches. The unit is an outlier's loss.
 
         The batch of the poses, for example :math:`(H, B)` or :math:`(P, H)`, broadcasts with the batch of the term.
         """

@@ -28,7 +28,7 @@ __all__ = ["create_solver", "list_solvers", "solve_pnp"]
 _Peer: TypeAlias = Literal[
     "opencv-epnp", "opencv-sqpnp", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap"
 ]
-# Iterations of the classical robust LM: `_FEW` for a start from another method's pose, `_MANY` from the identity.
+# Iterations of the classical robust LM: `_FEW` if another method gives the start, `_MANY` from the identity.
 _FEW, _MANY = 10, 30
 # Number of pairs in each sample of the paper's RANSAC.
 _PAPERS_SAMPLE = 7
@@ -111,7 +111,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
             also take the options of :class:`~kornia_pnpnet.solver.PnPNet`.
 
     Returns:
-        The solver as a module in evaluation mode. Its parameters do not require gradients, so that a result has an
+        The solver as a module in evaluation mode. Its parameters do not require gradients. A result therefore has an
         autograd graph only if an input requires gradients. To train a shipped solver further, load the solver with
         ``PnPNet.from_pretrained``.
 
@@ -156,7 +156,7 @@ def solve_pnp(
     dist: Tensor | None = None,
     fisheye: Tensor | None = None,
 ) -> Tensor:
-    r"""Find world-to-camera matrices despite outliers, with the signature of :func:`kornia.geometry.solve_pnp_dlt`.
+    r"""Find world-to-camera matrices despite outliers. The signature follows :func:`kornia.geometry.solve_pnp_dlt`.
 
     To pass masks or noise, or to get weights and a probability, call a solver of :func:`create_solver`. ``solver`` is
     one of :func:`list_solvers`, or a module with the signature of a solver. Named solvers are cached. For the other

@@ -74,7 +74,7 @@ class Pose(NamedTuple):
 
     @classmethod
     def from_rvec(cls, rvec: Tensor, translation: Tensor) -> Pose:
-        r"""A pose from a rotation vector and a translation, which are OpenCV's ``rvec`` and ``tvec``.
+        r"""A pose from a rotation vector (OpenCV's ``rvec``) and a translation (``tvec``).
 
         Args:
             rvec: axis times angle in radians, shape :math:`(B, 3)`.
@@ -89,7 +89,7 @@ class Pose(NamedTuple):
 
     @classmethod
     def from_quaternion(cls, quaternion: Tensor, translation: Tensor) -> Pose:
-        r"""A pose from a quaternion in the order :math:`(w, x, y, z)` of COLMAP and Kornia, and a translation.
+        r"""A pose from a translation and a quaternion in the order :math:`(w, x, y, z)` of COLMAP and Kornia.
 
         Args:
             quaternion: quaternion of any length except 0, shape :math:`(B, 4)`.
@@ -196,7 +196,7 @@ def with_rotation(pose: Pose) -> Pose:
 
 
 def sound_pose(pose: Pose, sound: Tensor) -> Pose:
-    """Replace the poses (*) that are not ``sound``, bool (*), by the identity, which has no gradient."""
+    """Replace poses (*) by the identity, without gradient, where ``sound``, bool (*), is false."""
     eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
     rotation = torch.where(sound[..., None, None], pose.rotation, eye)
     return Pose(rotation, torch.where(sound[..., None], pose.translation, 0.0))
@@ -244,11 +244,11 @@ class Status(IntEnum):
     #: infinite, a negative weight or sigma, a covariance that is not positive semi-definite, an invalid prior, or a
     #: rotation of ``cam_from_rig`` whose determinant is not positive.
     NOT_FINITE = 3
-    #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``, ``fx`` or ``fy`` is 0, or almost
-    #: all pixels are over 89.9 degrees off the optical axis, so that the intrinsics do not fit the pixels.
+    #: The intrinsics are not a multiple of ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``, ``fx`` or ``fy`` is 0, or the
+    #: intrinsics do not fit the pixels: almost all pixels are over 89.9 degrees off the optical axis.
     CAMERA = 4
     #: The pairs are too little evidence for the best pose. Solvers return this status for problems of three pairs; use
-    #: :func:`~kornia_pnpnet.propose.p3p.p3p` for such problems.
+    #: :func:`~kornia_pnpnet.propose.p3p.p3p` instead.
     NOT_BELIEVED = 5
     #: Fewer than 3 pairs are in front of the camera at the best pose.
     BEHIND = 6
@@ -263,7 +263,7 @@ class Status(IntEnum):
 
 
 class Alternatives(NamedTuple):
-    r"""Other poses that explain the pairs nearly as well as the pose of the result, without gradient.
+    r"""Other poses, without gradient, that explain the pairs nearly as well as the result's pose.
 
     Attributes:
         rotation: world-to-camera rotations by descending probability, shape :math:`(B, S, 3, 3)`.
@@ -301,10 +301,10 @@ class PnPResult(NamedTuple):
         weights: final weight of each pair, in the caller's order, shape :math:`(B, N)`.
         cost: robust loss of the pairs and of a prior, divided by the number of pairs, in the unit of the kernel (see
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
-        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, ``intrinsics``,
-            ``dist`` and the fields above are finite, but have a gradient only with ``gradient="always"``.
-        init: the first guess. The first guess of every valid problem has a gradient, even if the refinement failed, so
-            that an initialiser can learn from failures.
+        ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the pose, weights,
+            cost, ``intrinsics`` and ``dist`` are finite, but have a gradient only with ``gradient="always"``.
+        init: the first guess. The first guess of every valid problem has a gradient. An initialiser can thus learn even
+            if the refinement fails.
         status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
         probability: estimated probability that the rotation error is at most 10 degrees, and the translation error at
             most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. Solvers of other
@@ -315,8 +315,8 @@ class PnPResult(NamedTuple):
             replaces an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
         sigma: standard deviation of a pixel coordinate in the caller's pixels, estimated from the inliers, shape
-            :math:`(B,)`, without gradient. The noise of points is included. If the standard deviation differs between
-            pairs, ``sigma`` is the geometric mean over all pairs that are not padding.
+            :math:`(B,)`, without gradient. The noise of world points is included. If the standard deviation differs
+            between pairs, ``sigma`` is the geometric mean over all pairs that are not padding.
         inliers: which pairs are inliers of the pose, bool, shape :math:`(B, N)`.
     """
 
@@ -404,8 +404,8 @@ class PnPResult(NamedTuple):
 class Problems(NamedTuple):
     r"""A batch of problems with their true poses. Every data source yields such batches.
 
-    The fields from ``img_sigma`` on are inputs of solvers. For shapes and units see :meth:`PnPNet.forward
-    <kornia_pnpnet.solver.PnPNet.forward>`.
+    ``img_sigma`` and all later fields are optional inputs of solvers; ``None`` means unknown. For shapes and units see
+    :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
 
     Attributes:
         world_points: shape :math:`(B, N, 3)`.
@@ -413,7 +413,7 @@ class Problems(NamedTuple):
         intrinsics: camera matrices, shape :math:`(B, 3, 3)`, in a rig :math:`(B, N, 3, 3)`.
         pose: the true world-to-camera pose; for a rig, the pose of the rig.
         inliers: whether a pair is an inlier, bool, shape :math:`(B, N)`.
-        img_sigma: standard deviation of the noise on each pixel coordinate. ``None`` means unknown, also below.
+        img_sigma: standard deviation of the noise on each pixel coordinate.
         world_sigma: standard deviation of the noise on each world coordinate.
         confidence: belief that a pair is an inlier.
         img_cov: covariance of each pixel's noise, in place of ``img_sigma``.
@@ -447,7 +447,7 @@ class Problems(NamedTuple):
     @property
     @full_precision
     def true_cam_points(self) -> Tensor:
-        """The points in the frame of their camera at the true pose, shape :math:`(B, N, 3)`."""
+        """The points in the frame of their camera, computed with the true pose, shape :math:`(B, N, 3)`."""
         points = self.world_points @ self.pose.rotation.mT + self.pose.translation[..., None, :]
         if self.cam_from_rig is None:
             return points

@@ -56,7 +56,7 @@ class _Call(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """One pass from a problem to a result, with the proposed starts and the refined pose."""
+    """One run of the solver: the problem, its frame, the proposed starts, the refined pose, and the result."""
 
     problem: Problem
     frame: Frame
@@ -93,21 +93,21 @@ class PnPNet(PretrainedMixin):
             pairs (see :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
             :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
             in evaluation mode, the effort is adaptive if the initialiser estimates the noise and the refinement has
-            iterations. Two more steps depend on the data unless the effort is ``"fixed"``. In evaluation mode, poses of
+            iterations. Unless the effort is ``"fixed"``, the data affect two more steps. In evaluation mode, poses of
             single cameras are compared with other poses (see :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
             For rigs and bearings, RANSAC chooses the number of its samples. The effort is always fixed in exported
             graphs, with ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If no problem of the
-            first batches is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems. The gradient of a
-            problem's loss with respect to its normalised inputs then has a norm of at most 10. To train a network from
-            random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+            first batches is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems, but the
+            gradients of a problem's loss with respect to normalised inputs are limited to a norm of 10. To train a
+            network from random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8. The views are the problem itself and its rotated or mirrored
             copies. A network proposes a different pose for each view (see :mod:`kornia_pnpnet.propose.views`).
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.
-            The intrinsics of the call then give the principal point, the aspect ratio, and the ratio of the skew to the
+            The intrinsics of the call give the principal point, the aspect ratio, and the ratio of the skew to the
             focal length. With ``SetInit`` the refinement starts from the middle of the range of focal lengths. A search
             with P3P follows if the refined pose is not believed. With another initialiser, a given pose, or ``radial``,
-            the search gives the start. A problem is not ``ok`` when the standard deviation of log f exceeds 0.15.
+            the search comes first. A problem is not ``ok`` when the standard deviation of log f exceeds 0.15.
         focal_sigma: standard deviation of the logarithm of the caller's focal length, for example 0.1 if the focal
             length is known to about 10 %. ``None``: the caller's focal length is ignored.
         radial: number of coefficients of radial distortion, 0 to 2, that are estimated together with an unknown focal
@@ -191,14 +191,14 @@ class PnPNet(PretrainedMixin):
                 vectors of any length in the camera's frame (see :func:`~kornia_pnpnet.cameras.bearings`).
             intrinsics: camera matrices, shape :math:`(B, 3, 3)` or :math:`(3, 3)`; or Kornia's cameras, whose
                 extrinsics are ignored. In a rig, each pair may have its own matrix, shape :math:`(B, N, 3, 3)`. With
-                bearings, intrinsics may be ``None``. Sigmas and thresholds are then in radians. If intrinsics are given
-                with bearings, sigmas and thresholds are in pixels at the given focal length.
+                bearings, intrinsics may be ``None``. Without intrinsics, sigmas and thresholds are in radians. If
+                bearings come with intrinsics, sigmas and thresholds are in pixels at the given focal length.
             weights: weight of each pair, for both u and v, at least 0, shape :math:`(B, N)`; ``None``: 1.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
-                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. A matrix of
-                ``init``, ``prior`` or ``cam_from_rig`` that is not exactly a rotation is replaced by the nearest
-                rotation. ``init`` is ignored if it is not finite, or if the determinant of its matrix is not positive.
+                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. The matrices of
+                ``init``, ``prior`` and ``cam_from_rig`` are replaced by the nearest rotations. ``init`` is ignored if
+                it is not finite, or if the determinant of its matrix is not positive.
             img_sigma: standard deviation of the noise on each pixel coordinate, at least 0: a number, or a tensor of
                 shape :math:`(B,)` or :math:`(B, N)` with NaN where unknown. With ``img_sigma`` or ``world_sigma``,
                 residuals and the scales of the refinement's kernel are in standard deviations.
@@ -223,7 +223,7 @@ class PnPNet(PretrainedMixin):
             fisheye: the four coefficients of ``cv2.fisheye``, in place of ``dist``, shape :math:`(B, 4)` or
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out. To keep such pixels, pass bearings.
             cam_from_rig: the transform from the frame of a rig (several cameras) to the frame of each pair's camera,
-                :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. The solved pose is then the pose of the rig.
+                :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. For a rig, the solved pose is the pose of the rig.
             first_stage_only: return the first guess without refinement (the paper's "Net"), as solvers with ``m=0`` do.
             gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`. ``None``: the solver's own option.
             alternatives: largest number of alternative poses to return, see
@@ -310,14 +310,14 @@ class PnPNet(PretrainedMixin):
         """Compile the first stage, one iteration and the final stage of the solver in place, with ``torch.compile``.
 
         The first call compiles for some seconds. A new number of pairs, a new dtype, or the first call with gradients
-        causes a new compilation. A new batch size causes none. RANSAC is never compiled. Parts that cannot be compiled
-        run uncompiled after one warning. If there is no C++ compiler, or if PyTorch is older than 2.13, all parts run
-        uncompiled. A copy of the solver compiles again.
+        causes a new compilation. A new batch size causes no compilation. RANSAC is never compiled. Parts that cannot
+        be compiled run uncompiled after one warning. If there is no C++ compiler, or if PyTorch is older than 2.13, all
+        parts run uncompiled. A copy of the solver compiles again.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.
-            whole: compile the whole solver as one graph. The effort is then fixed. The first call takes longer.
-                Calls with few problems then take half the time, because less Python code runs.
+            whole: compile the whole solver as one graph, with fixed effort. The first call takes longer. Later
+                calls with few problems take half the time, because less Python code runs.
         """
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
@@ -327,7 +327,7 @@ class PnPNet(PretrainedMixin):
         return self._with_alternatives(attempt, call.alternatives) if call.alternatives else attempt.result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
-        """Initialise an unknown focal length. Return whether the value is *nominal*, the middle of the range."""
+        """Initialise an unknown focal length, and tell whether the value is *nominal* (the middle of the range)."""
         if self.focal == "known":
             return inputs, False
         inputs = with_nominal_focal(inputs, self.focal_sigma, self.radial)
@@ -443,7 +443,7 @@ class PnPNet(PretrainedMixin):
 
     @torch.no_grad()
     def _with_alternatives(self, attempt: _Attempt, most: int) -> PnPResult:
-        """Add to the result other poses that explain the pairs nearly as well as the result's pose."""
+        """Add at most ``most`` alternative poses to the result."""
         frame, result, problem = attempt.frame, attempt.result, attempt.problem.seen_with(attempt.refined.state.zoom)
         found = find_alternatives(self.refine, problem, attempt.starts, frame.apply(result.pose), frame.valid, most)
         poses = frame.undo(Pose(found.rotation, found.translation))

@@ -21,14 +21,12 @@ from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import Pose, Problems, pose_errors, success
 from kornia_pnpnet.cli import main
-from kornia_pnpnet.core.trees import iter_tensors
-from kornia_pnpnet.data import Scene, SyntheticProblems, View
+from kornia_pnpnet.data import Scene, View
 from kornia_pnpnet.problem import State
 from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import BACKWARDS
 from kornia_pnpnet.refine.residual import moved
 
-COUNT = 20_000
 # 99.9 % points of the chi-square distribution by degrees of freedom. The seeds are fixed, so that results do not vary.
 CHI_SQUARE = {1: 10.83, 2: 13.82, 3: 16.27, 6: 22.46, 8: 26.12, 19: 43.82}
 
@@ -38,10 +36,10 @@ NAN, INF = float("nan"), float("inf")
 TIMES = int(os.environ.get("PNPNET_EXAMPLES", "1"))
 
 
-def assert_same(one: Any, two: Any, rtol: float = 0.0, atol: float = 0.0) -> None:
+def assert_same(one: Any, two: Any, rtol: float = 0.0, atol: float = 0.0, **more: Any) -> None:
     """The same tensors in two trees, to the bit unless a tolerance is given."""
     for a, b in zip(pytree.tree_leaves(one), pytree.tree_leaves(two), strict=True):
-        torch.testing.assert_close(a, b, rtol=rtol, atol=atol)
+        torch.testing.assert_close(a, b, rtol=rtol, atol=atol, **more)
 
 
 @contextlib.contextmanager
@@ -116,16 +114,6 @@ def assert_counts(counts, shares=None):
     counts = counts.double()
     expected = counts.sum() * (torch.ones(len(counts)) / len(counts) if shares is None else torch.tensor(shares))
     assert ((counts - expected).square() / expected).sum() < CHI_SQUARE[len(counts) - 1]
-
-
-def draw(n=9, batch=COUNT, **options):
-    return SyntheticProblems(n=n, batch_size=batch, seed=7, dtype=torch.float64, **options).batch(0)
-
-
-def same(one, two):
-    """Whether two trees hold the same numbers, NaN included."""
-    pairs = zip(iter_tensors(one), iter_tensors(two), strict=True)
-    return all(a.dtype == b.dtype and torch.allclose(a, b, rtol=0, atol=0, equal_nan=True) for a, b in pairs)
 
 
 def arrays(problems):

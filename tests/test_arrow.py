@@ -205,6 +205,10 @@ def test_results_of_shards_are_those_of_the_tables_and_not_taken_for_those_of_an
         with pytest.raises(InputError, match=name):
             solve_shards(other, [folder], out, name=name)
     assert solve_shards(other, [folder], out, name="pnpnet-n9", overwrite=True).shards == 3
+    for changed in (Solve("pnpnet-n9", m=2), Solve("pnpnet-n9", intrinsics=torch.eye(3))):
+        with pytest.raises(InputError, match="options"):
+            solve_shards(changed, [folder], out, name="pnpnet-n9")
+    assert solve_shards(Solve("pnpnet-n9"), [folder], out, name="pnpnet-n9").kept == 3
     (out / "part0.parquet").write_bytes(b"{")
     with pytest.raises(InputError, match="part0"):
         solve_shards(other, [folder], out, name="pnpnet-n9")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import assert_same, finite, make_view, rate, reprojection_errors, same
+from helpers import assert_same, finite, make_view, rate, reprojection_errors
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
@@ -71,7 +71,7 @@ def draw(*sources, outliers="none", n=9, count=20, **options):
 def test_synthetic_sets_are_the_protocols():
     (entry,) = draw("synthetic", outliers="2").values()
     expected = SyntheticProblems(batch_size=1000, seed=3, outliers=OutlierMix(count=2)).batch(0)
-    assert same(entry.problems, expected.map(lambda part: part[:20]))
+    assert_same(entry.problems, expected.map(lambda part: part[:20]))
     assert entry.description == {"source": "paper", "outliers": 2, "mismatch_share": 0.5, "seed": 3}
     assert (entry.max_rotation_deg, entry.max_translation, entry.unit) == (1.0, 0.2, "m")
 
@@ -117,7 +117,7 @@ def test_mismatches_only_have_pixels_of_their_own(scenes):
     ((name, entry),) = draw("room", outliers="4", count=1000, mismatches_only=True, dtype=torch.float64).items()
     assert name == "room, n = 9, 4 mismatches"
     mix = OutlierMix(count=4, mismatch_share=1.0)
-    assert same(entry.problems, SceneProblems(scene(), seed=3, outliers=mix, num_spares=4).batch(0))
+    assert_same(entry.problems, SceneProblems(scene(), seed=3, outliers=mix, num_spares=4).batch(0))
 
 
 def test_every_n_has_every_mix_and_a_set_is_the_same_beside_others(scenes):
@@ -126,7 +126,7 @@ def test_every_n_has_every_mix_and_a_set_is_the_same_beside_others(scenes):
     for (name, entry), (source, n, count) in zip(sets.items(), mixes, strict=True):
         assert name == f"{source}, n = {n}, {count} outliers"
         alone = draw(source, outliers=str(count), n=n)[name]
-        assert same(entry.problems, alone.problems)
+        assert_same(entry.problems, alone.problems)
         assert entry.description == alone.description
 
 
@@ -134,7 +134,7 @@ def test_scenes_are_the_protocols_and_of_one_name_are_named_by_their_paths(scene
     """The limits depend on the unit."""
     (entry,) = draw("here/room", outliers="2", count=1000, dtype=torch.float64).values()
     assert entry.description == {"source": "room", "path": "here/room", "outliers": 2, "mismatch_share": 0.5, "seed": 3}
-    assert same(entry.problems, SceneProblems(scene(), seed=3, outliers=OutlierMix(count=2)).batch(0))
+    assert_same(entry.problems, SceneProblems(scene(), seed=3, outliers=OutlierMix(count=2)).batch(0))
     assert (entry.max_translation, entry.unit) == (0.2, "m")
     (arbitrary,) = draw("here/room", metric=False).values()
     assert (arbitrary.max_translation, arbitrary.unit) == (0.005 * scene().median_depth, "")

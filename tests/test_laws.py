@@ -4,7 +4,7 @@ from itertools import product
 
 import pytest
 import torch
-from helpers import assert_same, make_scene, many, other_defaults, same
+from helpers import assert_same, make_scene, many, other_defaults
 from hypothesis import given
 from hypothesis import strategies as st
 from laws import CAMERAS, FOCALS, LAWS, NOISES, PEERS, Case, applies, build, gradcheck
@@ -61,7 +61,7 @@ def test_both_precisions_see_the_same_problems(points, n, seed, outliers):
         source, options = data.SyntheticProblems, {"points": points, "axis_ratio": 3.0, "known_noise": 1.0, **options}
     single, double = (source(**options, dtype=dtype).batch(seed) for dtype in (torch.float32, torch.float64))
     assert double.world_points.dtype == torch.float64
-    assert same(single, map_tensors(lambda x: x.float() if x.is_floating_point() else x, double))
+    assert_same(single, map_tensors(lambda x: x.float() if x.is_floating_point() else x, double))
 
 
 EVERY_KIND = data.OutlierMix(

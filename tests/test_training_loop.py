@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import assert_same, same
+from helpers import assert_same
 from kornia.core.exceptions import BaseError
 from lightning_fabric import Fabric
 
@@ -263,8 +263,7 @@ def make_source(kind=SyntheticProblems, **options):
     "source", [make_source(dtype=torch.float64), VaryingSize(SyntheticProblems, n=[4, 7], batch_size=6, seed=3)]
 )
 def test_batches_are_those_of_the_source_in_order(workers, source):
-    found = [same(problems, source.batch(i)) for i, problems in enumerate(stream_batches(source, 4, 25, workers), 4)]
-    assert found == [True] * 21
+    assert_same([*stream_batches(source, 4, 25, workers)], [source.batch(i) for i in range(4, 25)], equal_nan=True)
     assert list(stream_batches(source, 3, 3, workers)) == []
     assert not multiprocessing.active_children()
 
@@ -273,7 +272,7 @@ def test_batches_are_those_of_the_source_in_order(workers, source):
 def test_an_error_of_the_source_arrives_with_its_message(workers):
     source = make_source(BrokenSource)
     stream = stream_batches(source, 5, 100, workers)
-    assert all(same(next(stream), source.batch(index)) for index in (5, 6))
+    assert_same([next(stream), next(stream)], [source.batch(5), source.batch(6)], equal_nan=True)
     with pytest.raises(ArithmeticError, match="batch 7 cannot be drawn"):
         next(stream)
     assert not multiprocessing.active_children()
@@ -283,11 +282,10 @@ def test_an_error_of_the_source_arrives_with_its_message(workers):
 def test_a_signal_to_the_group_does_not_end_the_workers(number):
     source = make_source()
     stream = stream_batches(source, 0, 30, 1)
-    assert same(next(stream), source.batch(0))
+    assert_same(next(stream), source.batch(0))
     (worker,) = multiprocessing.active_children()
     os.kill(worker.pid, number)
-    rest = [same(problems, source.batch(index)) for index, problems in enumerate(stream, 1)]
-    assert rest == [True] * 29
+    assert_same([*stream], [source.batch(index) for index in range(1, 30)], equal_nan=True)
 
 
 LEFT_OPEN = """

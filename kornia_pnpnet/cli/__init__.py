@@ -1,6 +1,6 @@
 """The command ``pnpnet``. Each subcommand is a module: the module's docstring is the help of the subcommand.
 
-A module's ``run`` returns the exit code. PyTorch is imported inside ``run``, so that bad arguments fail at once.
+A module's ``run`` returns the exit code. Only ``run`` imports PyTorch, so bad arguments are reported without delay.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _reason(error: Exception) -> str:
-    """Describe an error of the input or the machine in one line; any other error is raised again."""
+    """Describe in one line an error of the input or of the machine. Raise any other error again."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return " ".join(f"{error.filename}: {error.strerror}".splitlines())  # file names may contain line breaks
     from kornia.core.exceptions import BaseError

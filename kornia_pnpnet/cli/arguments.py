@@ -1,4 +1,4 @@
-"""The arguments of all commands in one table, their parser, and the solver for ``--solver``."""
+"""A table of the arguments of all commands, parsers of arguments, and a loader of the solver for ``--solver``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-# Largest standard deviation of log(focal length) for `--focal`. A larger number is taken for a focal length in pixels.
+# Largest standard deviation of log(focal length). `--focal` refuses a larger number: it is probably in pixels.
 _MOST_SIGMA = 3.0
 
 #: Names of synthetic data for ``--data``.
@@ -23,7 +23,7 @@ SYNTHETIC = ("synthetic", "gaussian_pose", "any_rotation", "slab", "mixed")
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser that accepts lists of negative numbers as values and reports errors in one line."""
+    """A parser that accepts values such as ``-1,2`` and reports errors in one line."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

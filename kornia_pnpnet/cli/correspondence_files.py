@@ -20,7 +20,7 @@ _COLUMNS = ("X", "Y", "Z", "u", "v")
 
 
 class ImageCorrespondences(NamedTuple):
-    """The correspondences of one image, in float32 if all arrays of the file are in float32, else in float64."""
+    """The correspondences of one image. The dtype is float32 if all arrays of the file are float32, else float64."""
 
     world_points: Tensor  # (N, 3)
     img_points: Tensor  # pixels, (N, 2)
@@ -28,7 +28,7 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort pixels with ``kornia_pnpnet.data.colmap.undistort``. A pixel without a solution gets weight 0."""
+        """Call ``kornia_pnpnet.data.colmap.undistort``. A pixel that cannot be undistorted gets weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -62,7 +62,7 @@ def _pinhole(matrix: Tensor, source: str | Path) -> Tensor:
 
 
 def read_correspondences(path: str | Path) -> ImageCorrespondences:
-    """Read a CSV file (columns ``X,Y,Z,u,v``, optionally ``weight``) or an NPZ file (arrays named like the fields).
+    """Read a CSV file (columns ``X,Y,Z,u,v``, optionally ``weight``) or an NPZ file (arrays named as in the result).
 
     Raise ``InputError`` for fewer than three correspondences, a missing column or array, or an invalid number.
     """
@@ -95,7 +95,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
         raise InputError(path, f"world_points of {arrays['world_points'].shape} are many problems: pass --batch")
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     arrays.setdefault("weights", np.ones(count, np.float32))
-    # A file of float32 arrays is solved in float32, so that the solver detects points that need more digits.
+    # Float32 arrays stay in float32, so that the solver detects points that need more digits than float32 has.
     dtype = np.float32 if np.result_type(np.float32, *arrays.values()) == np.float32 else np.float64
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
     tensors = {}

@@ -1,4 +1,4 @@
-"""Compare solvers with OpenCV and PoseLib, then train for a minute.
+"""Compare PnP-Nets with OpenCV and PoseLib, and train a network for a minute.
 
 Without --data, the problems are random. The demo prints a table, trains a small network and draws pictures.
 
@@ -73,7 +73,7 @@ def _result(row: Mapping[str, Any]) -> str:
 
 
 def _draw_one(path: Path, name: str, solver: nn.Module, entry: EvaluationData) -> Path:
-    """Among the problems with the most outliers, draw the first. The choice does not depend on the solver."""
+    """Plot the first of the problems with the most outliers. The choice does not depend on the solver."""
     import torch
 
     from kornia_pnpnet.cameras import reproject

@@ -1,7 +1,7 @@
 """Write a solver as an ONNX model or as a package that is compiled ahead of time.
 
 The suffix of the file selects the format. ONNX Runtime runs a model (.onnx) without PyTorch. A package (.pt2) loads
-without compiling, in Python and in C++ with libtorch. A package runs on CPUs like the CPU that compiled it.
+without compiling, in Python and in C++ with libtorch. A package runs on the kind of CPU that compiled it.
 
   pnpnet export pnpnet-set.onnx
   pnpnet export pnpnet-n9.pt2 --solver pnpnet-n9 --batch 1
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     solver = load_solver_without_truth(arguments.solver)
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--solver: {arguments.solver} belongs to another library and cannot be exported")
-    target.parent.mkdir(parents=True, exist_ok=True)  # an error appears here, before minutes of tracing
+    target.parent.mkdir(parents=True, exist_ok=True)  # an invalid folder fails here, before minutes of tracing
     if target.is_dir():
         raise ValueError(f"'{target}' is a folder")
     if target.exists() and not arguments.overwrite:

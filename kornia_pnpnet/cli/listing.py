@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-#: Descriptions of solvers by the start of a solver's name. The longest matching key applies.
+#: Descriptions of solvers. A key is the start of a solver's name, and the longest matching key applies.
 _WHAT = {
     "pnpnet-set": "network over any number of pairs, then learned LM: the default",
     "pnpnet-n": "the paper's network for that number of pairs, then learned LM; for cameras near the world's axes",

@@ -63,17 +63,18 @@ def solve_shards(
         solve: the solver.
         sources: shards, or folders of shards. The report names the shards that cannot be read or solved.
         out: folder of the results. None of the shards may be in this folder.
-        name: name of the solver. Results files store this name and the digest of the solver's parameters.
-        batch: largest number of problems that are read and solved at once.
+        name: name of the solver. Results files store this name and a digest of weights, options and intrinsics.
+        batch: largest number of problems that are solved at once. Parquet shards are also read in such parts.
         overwrite: also solve the shards that have results.
         progress: show a progress bar if stderr is a terminal and tqdm is installed.
 
     Raises:
         InputError: when there is no shard, when two shards would have results of the same name, when ``out`` is the
-            folder of a shard, or when a shard has results of another solver.
+            folder of a shard, or when a shard has results of another solver, other options or other intrinsics.
         OSError: when the results cannot be written.
     """
-    parameters = digest(*chain.from_iterable(sorted(solve.solver.state_dict().items())))
+    state = chain.from_iterable(sorted(solve.solver.state_dict().items()))
+    parameters = digest(repr(solve.solver), *state, solve.intrinsics)  # the text of a solver shows its options
     mark = json.dumps({"name": name, "parameters": parameters}).encode()
     waiting, kept = {}, 0
     for stem, shard in _find(sources, Path(out)).items():
@@ -83,7 +84,7 @@ def solve_shards(
         elif _solver_of(target) == mark:
             kept += 1
         else:
-            raise InputError(target, f"no results of {name} with these weights: use another folder or --overwrite")
+            raise InputError(target, f"no results of {name} with these options: use another folder or --overwrite")
     counts, failed = np.zeros(2, int), []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():
@@ -123,7 +124,7 @@ def _solver_of(target: Path) -> bytes | None:
 
 
 def _bar(shards: Iterable[Path], shown: bool) -> Any:
-    """Make a progress bar over the problems of shards, or an empty context."""
+    """Make a progress bar that counts problems. If ``shown`` is false or tqdm is missing, make an empty context."""
     if not shown or find_spec("tqdm") is None:
         return nullcontext()
     from tqdm import tqdm

@@ -1,11 +1,11 @@
 """Find the pose of one image, or of many problems in files.
 
-The pose of one image, x_cam = R x_world + t, is printed as a table on a terminal, and as JSON into a pipe or with
---json. The inliers' residuals give the standard deviations. The rotation has one about each axis of the camera.
+The pose of one image, x_cam = R x_world + t, is printed as a table. In a pipe or with --json, JSON is printed instead.
+The inliers' residuals give the standard deviations. The rotation has one standard deviation per axis of the camera.
 
   pnpnet solve matches.csv --intrinsics 3400,3400,3024,2016 --plot pose.png
 
-With an unknown focal length, pass 1,1 and the principal point, which is usually the middle of the image:
+If the focal length is unknown, pass 1,1 in its place. The principal point is usually the middle of the image:
 
   pnpnet solve matches.csv --focal unknown --intrinsics 1,1,3024,2016
 
@@ -42,7 +42,7 @@ _ADVICE = {
     "offset before they become float32",
     "behind": "the points are behind the camera; check the axes: x to the right, y down, z forward",
 }
-# Largest plausible noise, and smallest plausible share of inliers. A file in another convention violates a limit.
+# Largest plausible noise, and smallest plausible share of inliers. These limits detect files in another convention.
 _MOST_NOISE_PX, _LEAST_SHARE = 10.0, 0.5
 _MISTAKES = (
     "swapped columns, another image size, y up? try --diagnose; many outliers? try --solver p3p-ransac:threshold=PX"

@@ -38,7 +38,7 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
         path: the folder or the file.
         metric: whether the unit of the scene is the metre.
         min_points: images with fewer points are skipped.
-        max_error_px: in a file of matches, the largest reprojection error of an inlier, in pixels.
+        max_error_px: largest reprojection error, in pixels, of an inlier in a file of matches.
 
     Raises:
         FileNotFoundError: if ``path`` does not exist or the folder has no model.
@@ -73,8 +73,8 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
         img_points: distorted pixels, shape (N, 2).
 
     Returns:
-        Two float64 tensors. The first, (3, 3), is the matrix of the pinhole camera with the same focal length and
-        principal point. The second, (N, 2), has the undistorted pixels, which are NaN where the model has no inverse.
+        Two float64 tensors. The first (3, 3) is a pinhole camera matrix. It has the focal length and the principal
+        point of ``camera``. The second (N, 2) has the undistorted pixels, NaN where the model has no inverse.
 
     Raises:
         ImportError: if ``pycolmap`` is missing.

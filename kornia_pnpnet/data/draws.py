@@ -70,7 +70,7 @@ def normal(shape: Sequence[int], generator: torch.Generator) -> Tensor:
 
 
 def log_uniform(shape: Sequence[int], low: float, high: float, generator: torch.Generator) -> Tensor:
-    """Numbers in ``[low, high)`` with uniform logarithms."""
+    """Log-uniform numbers in ``[low, high)``."""
     return uniform(shape, math.log(low), math.log(high), generator).exp_()
 
 

@@ -1,4 +1,4 @@
-"""Mixtures of sources and of priors of points, and batches of varying size."""
+"""Mixtures of sources, mixtures of priors, and batches that differ in the number of pairs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class MixedProblems:
         sizes = _split(batch_size, shares, round)
         parts = zip(sources, sizes, strict=True)
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
-        # Sources are interleaved, so that the shares of every slice are approximately the shares of the whole batch.
+        # Sources are interleaved, so that every slice of a batch has approximately the shares of the whole batch.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__), device="cpu")
 
@@ -89,13 +89,13 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
 
 
 def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], int]) -> list[int]:
-    """Split a batch in proportion to the shares; ``rounded`` rounds the bounds between the parts to integers."""
+    """Return sizes of parts in proportion to the shares. ``rounded`` rounds the bounds between parts to integers."""
     bounds = [rounded(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares))]
     return [end - start for start, end in pairwise([*bounds, batch_size])]
 
 
 def _alike(parts: list[Problems], name: str) -> list[Problems]:
-    """Give the field ``name`` equally many dimensions in all parts. If only some parts lack the field, they get NaN."""
+    """Give a field the same number of dimensions in all parts. If some parts have the field, the others get NaN."""
     values = [getattr(part, name) for part in parts]
     dimensions = {0 if value is None else value.ndim for value in values}
     if len(dimensions) == 1:

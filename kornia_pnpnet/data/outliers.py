@@ -16,7 +16,7 @@ from kornia_pnpnet.data.draws import log_uniform, normal, random_poses, uniform,
 
 __all__ = ["OutlierKind", "OutlierMix", "crowd_leaders", "near_offsets", "structured_points"]
 
-# Default range of `near_pixels`, and smallest values of its two ends, all in standard deviations of the pixel noise.
+# `near_pixels`: default range, and smallest lower and upper end. The unit is the standard deviation of the pixel noise.
 # The numbers are choices. Noise hardly exceeds 5 standard deviations.
 _NEAR, _LEAST_NEAR = (5.0, 50.0), (5.0, 10.0)
 # `_SLACK` is added to numbers of outliers before rounding down. A ratio of 0.33 then gives floor(n / 3) for n up to 15.
@@ -44,26 +44,26 @@ class OutlierMix:
     already have a kind.
 
     Args:
-        max_ratio: largest share of outliers. The limit is rounded down: 0.33 allows n // 3 outliers for n up to 15.
-        count: exact number of outliers. ``max_ratio``, ``min_count`` and ``min_inliers`` then have no effect.
-        min_count: smallest number of outliers. If the largest number is smaller, the largest number applies.
-        min_inliers: smallest number of inliers. The largest number of outliers is at most n - ``min_inliers``.
-        mismatch_share: probability that an outlier of none of the kinds below is a *mismatch*, which has the pixel of
-            another point. Otherwise, the outlier is a *sensing* outlier, which has a uniform pixel of the image.
+        max_ratio: largest share of outliers. n * ``max_ratio`` + 0.05 is rounded down: 0.33 gives n // 3 for n <= 15.
+        count: exact number of outliers. If given, ``max_ratio``, ``min_count`` and ``min_inliers`` have no effect.
+        min_count: smallest number of outliers. A ``min_count`` above the largest number is lowered to that number.
+        min_inliers: smallest number of inliers. At most n - ``min_inliers`` pairs are outliers.
+        mismatch_share: outliers of none of the kinds below are *mismatches* with this probability, else *sensing*
+            outliers. A mismatch has the pixel of another point. A sensing outlier has a uniform pixel of the image.
         near_share: probability that an outlier is *near*. The pixel of a near outlier is close to its point's pixel.
-        near_pixels: range of the distance, in pixels, between the pixel of a near outlier and the pixel of its point.
-            Distances are log-uniform. A lower end below 5 standard deviations of the pixel noise is raised to 5, and an
-            upper end below 10 is raised to 10. ``None`` means 5 to 50 standard deviations.
+        near_pixels: range of a near outlier's distance from the pixel of its point, in pixels. Distances are
+            log-uniform. The ends of the range are raised to at least 5 and 10 standard deviations of the pixel noise.
+            ``None`` means 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
         structured_ratio: range of the ratio of structured outliers to inliers. Each problem draws a uniform ratio.
-        structured_angle: largest rotation angle in radians. The pixels of structured outliers show a copy of the
-            problem's points. The copy is shifted, and is rotated by at most this angle.
-        mirrored_share: probability that the shifted and rotated copy of a problem's points is also mirrored.
+        structured_angle: largest rotation angle, in radians. Structured outliers have the pixels of a shifted and
+            rotated copy of the problem's points.
+        mirrored_share: probability that the copy for structured outliers is also mirrored.
         crowd_share: probability that a problem has *crowds*. All outliers of a crowd have the pixel of one pair, the
             leader. For each problem, the probability that an outlier joins a crowd is drawn uniformly from 0 to 1.
         max_crowds: largest number of crowds. Each problem draws a number of crowds uniformly from 1 to ``max_crowds``.
-        point_crowd_share: probability that the crowds of a problem share the leaders' world points, not the pixels.
+        point_crowd_share: probability that a problem's crowds share their leaders' world points instead of pixels.
 
     Example:
         >>> OutlierMix().max_count(9), OutlierMix(max_ratio=0.33).max_count(9), OutlierMix(count=2).max_count(9)

@@ -59,10 +59,10 @@ _NEARER = 0.3  # share of points on cars and trees
 _NOWHERE = 1e6  # height of a street's box, so large that no ray reaches the top
 # Largest field of view in degrees. A pinhole camera needs a field of view below 180 degrees.
 _WIDEST = 170.0
-# Depth maps: standard deviation of each coordinate of a map camera in the query camera's frame, divided by the mean
-# distance of the points. The directions from a point to the map camera and to the query camera differ by 10 to 40°.
+# Depth maps: standard deviation of a map camera's coordinates in the query camera's frame, divided by the points' mean
+# distance. The directions from a point to the map camera and to the query camera differ by 10 to 40°.
 _BASELINE = 0.3
-# Depth maps: smallest and largest error of a flying pixel's distance from its map camera, divided by this distance.
+# Depth maps: smallest and largest relative error of a flying pixel's distance from its map camera.
 _FLIGHT = (-0.3, 0.6)
 
 
@@ -170,7 +170,7 @@ class FacadePoints(_View):
     standard deviation of a tenth of the relief.
 
     Args:
-        field_of_view: range, in degrees, from which the field of view of the square image is drawn uniformly.
+        field_of_view: range of the field of view of the square image, in degrees. The field of view is uniform.
         window: range of the window's share of the image area. The share is log-uniform. All points lie in the window.
     """
 
@@ -236,20 +236,20 @@ class DrivePoints(_View):
 
 
 def _hits(rays: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Find where rays enter and leave a box, in units of ``rays``, (..., 3). A ray with enter >= leave misses it."""
+    """Find at which multiples ``rays``, (..., 3), enter and leave a box. If enter >= leave, a ray misses the box."""
     one, two = low / rays, high / rays
     return torch.minimum(one, two).amax(-1), torch.maximum(one, two).amin(-1)
 
 
 @dataclass(kw_only=True, eq=False)
 class DepthMaps:
-    r"""Errors of world points that come from the depth maps of several cameras.
+    r"""Errors of world points that several depth cameras have measured.
 
     Each world point comes from the depth map of one of ``maps`` cameras near the query camera. Three errors occur:
 
     - noise along the ray of the map camera. At the distance :math:`d` from the map camera, the standard deviation is
-      :math:`a d^2 / \bar d`, where :math:`\bar d` is the mean distance of the points from the query camera. The noise
-      of stereo cameras and of structured light also grows with the square of the distance.
+      :math:`a d^2 / \bar d`, where :math:`\bar d` is the mean distance of the points from the query camera. As with
+      stereo cameras and structured light, the noise grows with the square of the distance.
     - the error of the map camera's rotation. This error turns all points of one map about the map camera.
     - *flying pixels*: at the edge of an object, the measured distance lies between the object and the background. Pairs
       with a flying pixel are outliers.
@@ -257,7 +257,7 @@ class DepthMaps:
     Args:
         depth_noise: range of :math:`a`, the relative standard deviation at the distance :math:`\bar d`. Each problem
             draws a log-uniform number.
-        angle: range, in degrees, of the standard deviation of a map camera's rotation error about each axis. Each
+        angle: range of the standard deviation, in degrees, of a map camera's rotation error about each axis. Each
             problem draws a log-uniform number.
         flying_share: probability that a point is a flying pixel.
         maps: number of map cameras of a problem.

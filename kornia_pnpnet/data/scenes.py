@@ -87,7 +87,7 @@ class Scene:
 
     @property
     def median_depth(self) -> float:
-        """Median depth, in the unit of the scene, of the observed points of all images."""
+        """Median depth of the observed points of all images, in the unit of the scene."""
         return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
 
 

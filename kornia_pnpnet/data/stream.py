@@ -58,7 +58,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         prefetch_factor=_AHEAD,
         worker_init_fn=_ignore_signals,
         generator=torch.Generator(),  # the loader must not draw from PyTorch's global generator
-        # In processes of joblib, the default start method is joblib's own method, which a loader cannot use.
+        # In joblib's processes, the default start method is joblib's own. A loader cannot use that method.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
     arrays: Any = iter(loader)

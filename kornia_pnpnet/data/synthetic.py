@@ -30,17 +30,17 @@ _ANY = (0.0, math.inf)
 _AMOUNTS = {"img_sigma": _ANY, "world_sigma": _ANY, "degrees": (1.0, math.inf), "sigma_spread": (0.0, 3.0)}
 # Largest axis ratio. Up to this ratio, float32 resolves the shortest axis of a covariance.
 _MOST_RATIO = 100.0
-# Chosen limit of an inlier's pixel noise, in units of `img_sigma`. The limit holds for Student noise only.
+# Largest pixel noise of an inlier, in units of `img_sigma`. This choice applies to Student noise only.
 _MOST_NOISE = 10.0
 # Standard deviation, in pixels, that replaces 0 in a division.
 _TINY = 1e-9
-# A camera sees points up to about 87° from the optical axis. `_LEAST_COSINE`, the cosine of this angle, is a choice.
+# Smallest cosine between the optical axis and the ray of a visible point. This choice allows angles up to about 87°.
 _LEAST_COSINE = 0.05
-# If `half_image` is `None`: half the side of the largest image at focal length 1. Points may lie outside the image.
+# Half the side of the largest image at focal length 1, if `half_image` is `None`. Points may lie outside the image.
 _WIDEST_TANGENT = math.tan(math.radians(60.0))
-# The first pairs of a problem are never copies. Their number is a choice: eight pairs can still determine a pose.
+# Number of first pairs of a problem that are never copies. This is a choice: eight pairs can still determine a pose.
 _LEAST_ORIGINALS = 8
-# `_bunched` adds random blur to relative distances. The limit of the blur is a choice: at 2, a bunch is hardly visible.
+# Largest blur that `_bunched` adds to relative distances. This is a choice: at 2, a bunch is hardly visible.
 _MOST_BLUR = 2.0
 # Choices for confidences.
 _SEPARATION = (0.0, 4.0)  # mean score of noise-free inliers minus mean score of outliers
@@ -73,27 +73,27 @@ class SyntheticProblems(RandomProblems):
         focal: focal length in pixels. The principal point is the pixel (0, 0).
         half_image: half the side, in pixels, of the square image with the centre (0, 0). The pixels of *sensing*
             outliers are uniform in the image. ``None`` means the smallest image that contains the pixels of all points
-            of a problem. The field of view of this image is at most 120°.
+            of a problem, up to a field of view of 120°.
         img_sigma: standard deviation, in pixels, of the noise on each pixel coordinate, or a range.
         world_sigma: standard deviation of the noise on each world coordinate, or a range.
         degrees: degrees of freedom of Student noise on the pixels, at least 1, or a range. 0 means Gaussian noise. With
-            Student noise, ``img_sigma`` is the scale of the distribution, and pairs with more pixel noise than
+            Student noise, ``img_sigma`` is the scale of the distribution. Pairs whose pixel noise exceeds
             ``10 * img_sigma`` are outliers.
         sigma_spread: standard deviation of log(sigma) over the pairs of a problem, at most 3, or a range. With a spread
             above 0, the sigmas of a batch have the shape ``(batch_size, n)``.
         axis_ratio: ratio of the largest to the smallest standard deviation over the axes of a pair's noise, at most
             100. The axes are random. With a ratio above 1, ``img_sigma`` and ``world_sigma`` are root mean squares over
-            the axes, known noise is given as covariances, and ``known_noise`` must be 0 or 1.
-        known_noise: share of the problems that come with both sigmas. With 0, batches have no sigmas. With a share
-            above 0, a third of the other problems come with one of the two sigmas, and missing sigmas are NaN.
+            the axes, covariances replace the sigmas in batches, and ``known_noise`` must be 0 or 1.
+        known_noise: share of the problems that have both sigmas. With 0, batches have no sigmas. Otherwise, a third of
+            the remaining problems have one of the two sigmas, and missing sigmas are NaN.
         confidence_share: share of the problems that have confidences. The confidences of other problems are NaN. With
             a share of 0, batches have no confidences. Problems differ in how well confidences separate inliers from
             outliers, and in the scale of the confidences' logits.
-        bunched_share: share of the problems in which all inliers, *near* outliers and *structured* outliers are bunched
-            in one part of the image. The points of all other outliers come from the rest of the scene.
-        depth_maps: errors of depth cameras in the world points, in addition to the noise of ``world_sigma``. The
-            noise given to solvers excludes these errors. ``None`` means no errors of depth cameras.
-        copies_share: share of the problems that contain copies of pairs, as if a detector lists a place several times.
+        bunched_share: share of the problems whose inliers, *near* outliers and *structured* outliers are bunched in one
+            part of the image. The points of all other outliers come from the rest of the scene.
+        depth_maps: errors of depth cameras. World points get these errors and the noise of ``world_sigma``. Sigmas and
+            covariances exclude these errors. ``None`` means no errors of depth cameras.
+        copies_share: share of the problems that contain copies of pairs, as if a detector listed a point several times.
             A pair of such a problem is a copy with a probability of at most 0.5. The first 8 pairs are never copies.
         dtype: dtype of the batches. Numbers are drawn in float64.
         device: device of the batches. Numbers are drawn on the CPU.
@@ -164,7 +164,7 @@ class SyntheticProblems(RandomProblems):
         if mix.structured_share:
             moved = structured_points(cam_points, mix, generator)
             shown = torch.where(kind == OutlierKind.STRUCTURED, moved, shown)
-        # A pair whose point the camera cannot see gets a uniform pixel and is an outlier.
+        # If the camera cannot see a pair's point, the pair gets a uniform pixel and is an outlier.
         in_front = _is_in_front(shown)
         shown = torch.where(in_front, shown, 1.0)
         img_points = self.focal * shown[..., :2] / shown[..., 2:]
@@ -203,7 +203,7 @@ class SyntheticProblems(RandomProblems):
         is_copy = (unit((size, n), generator) < share) & (torch.arange(n) >= _LEAST_ORIGINALS)
         other = (n * unit((size, n), generator)).long()
         index = torch.where(is_copy, other, torch.arange(n))
-        # If n = 3, poses and cameras are indexed too. They do not change, because the first 8 pairs are never copies.
+        # If n = 3, poses and cameras are indexed too, but stay the same: the first 8 pairs are never copies.
         return problems.map(lambda x: x[torch.arange(size)[:, None], index] if x.shape[1:2] == (n,) else x)
 
     def _anywhere(self, scene: Tensor, generator: torch.Generator) -> Tensor:
@@ -235,7 +235,7 @@ class SyntheticProblems(RandomProblems):
     def _noise(
         self, shape: Sequence[int], sigma: Amount, degrees: Amount, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        r"""Draw noise, (B, N, D), with its standard deviations, (B, 1) or (B, N), and its covariances, (B, N, D, D).
+        r"""Draw noise (B, N, D). Also return its standard deviations (B, 1) or (B, N) and covariances (B, N, D, D).
 
         The covariances are ``None`` when ``axis_ratio`` is 1. For Student noise with :math:`\nu` degrees of freedom,
         standard normal noise of length :math:`r` is scaled to the length :math:`\sqrt{\nu(\exp(r^2/\nu) - 1)}`. In two
@@ -277,7 +277,7 @@ class SyntheticProblems(RandomProblems):
         return known
 
     def _confidence(self, inliers: Tensor, errors: Tensor, generator: torch.Generator) -> Tensor:
-        """Draw confidences, (B, N). ``errors``, (B, N), has the pixel noise of each pair in standard deviations."""
+        """Draw confidences, (B, N). ``errors`` (B, N) is the pixel noise of each pair in standard deviations."""
         each = self.batch_size, 1
         separation, noisiness = (uniform(each, *bounds, generator) for bounds in (_SEPARATION, _NOISINESS))
         score = normal(inliers.shape, generator) + torch.where(inliers, separation - noisiness * errors.log1p(), 0.0)
@@ -302,9 +302,9 @@ class CameraProblems(RandomProblems):
     Args:
         n: number of pairs per problem. For ``batch_size``, ``seed``, ``dtype`` and ``device`` see
             :class:`SyntheticProblems`.
-        field_of_view: range, in degrees, from which each camera draws its horizontal field of view uniformly.
-        depth_spread: range from which each problem draws its depth spread uniformly. Depths divided by the mean depth
-            are uniform from ``1 - spread`` to ``1 + spread``.
+        field_of_view: range of the horizontal field of view, in degrees. Each camera draws a uniform number.
+        depth_spread: range from which each problem draws a uniform spread. Depths, divided by the mean depth, are
+            uniform from ``1 - spread`` to ``1 + spread``.
         outlier_share: share of the pairs that are outliers. The number of outliers is rounded to an integer.
         img_sigma: standard deviation of the noise on each pixel coordinate, in pixels.
         cameras: number of cameras. Two or more cameras form a rig, and batches then have ``cam_from_rig``.

@@ -16,7 +16,7 @@ from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["KnownInliers", "KnownInliersAndNoise"]
 
-# From the true pose, 3 iterations reach the minimum of the cost to 7 digits, and 10 iterations to float64's precision.
+# From the true pose, 3 iterations reach the minimum of the cost to 7 digits. 10 iterations reach float64's precision.
 _ITERATIONS = 10
 
 
@@ -44,8 +44,8 @@ class KnownInliersAndNoise(Configured):
     r"""Least squares as in :class:`KnownInliers`, with each inlier weighted by the inverse variance of its pixel.
 
     The variance is :math:`\sigma_\mathrm{img}^2 + \sigma_\mathrm{world}^2\,\mathrm{tr}(J_x J_x^\top) / 2`, where
-    :math:`J_x` is the Jacobian of the pixel with respect to the world point at the true pose. If the problems have
-    covariances, they replace the sigmas and whiten the residuals. The result is then the maximum likelihood estimate.
+    :math:`J_x` is the Jacobian of the pixel with respect to the world point at the true pose. Known covariances
+    replace the sigmas and whiten the residuals. The result is then the maximum likelihood estimate.
 
     Args:
         img_sigma: standard deviation of a pixel coordinate. The default is the value of the protocol's synthetic data.

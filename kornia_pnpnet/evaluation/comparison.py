@@ -32,7 +32,7 @@ _MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
 
 
 class EvaluationData(NamedTuple):
-    """A set of problems in one batch, and the limits of a success."""
+    """A set of problems in one batch, and the largest errors of a success."""
 
     problems: Problems  #: The problems.
     max_rotation_deg: float = 1.0  #: Limit of the rotation error in degrees.
@@ -75,7 +75,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Solve the same problems with every solver.
 
-    A pose that is not finite is replaced by the identity, and its ``ok`` is false. Summaries are computed from errors
+    The identity replaces a pose that is not finite, and ``ok`` becomes false. Summaries are computed from errors
     that are rounded to six significant digits. The results file is written after every row. A call with the same
     arguments, or with further solvers and data sets, continues the file. The file of any other evaluation is refused.
 
@@ -189,7 +189,7 @@ def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int)
         calls = [_solve(solver, chunks[i % len(chunks)]) for i in range(max(repeats, len(chunks)))]
     finally:
         solver.train(was_training)
-    # A smaller last chunk is not timed, because the fixed cost of a call would raise the time per problem.
+    # The time of a smaller last chunk is left out, because the fixed cost of a call would raise the time per problem.
     full = len(chunks[0].world_points)
     seconds = statistics.median(elapsed / full for result, elapsed in calls if len(result.ok) == full)
     found = [(result.pose, result.ok) for result, _ in calls[: len(chunks)]]
@@ -210,7 +210,7 @@ def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int)
 
 
 def _solve(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
-    """Return the result and the time in seconds."""
+    """Solve the problems, and return the result and the elapsed seconds."""
     device = problems.world_points.device
     start = _now(device)
     if isinstance(solver, SeesTruth):

@@ -1,4 +1,4 @@
-"""The schema of results files, limited to the entries that readers use. The module needs pydantic."""
+"""The schema of results files, with only the entries that this package reads. The module needs pydantic."""
 
 # ruff: noqa: UP013  (one line for each small mapping)
 from __future__ import annotations
@@ -57,5 +57,5 @@ def _consistent(results: Any) -> Any:
     return results
 
 
-#: The content of a file of :func:`~kornia_pnpnet.evaluation.save_results`.
+#: Schema of the files that :func:`~kornia_pnpnet.evaluation.save_results` writes.
 Evaluation: Any = Annotated[_Results, AfterValidator(_consistent), Kept]

@@ -1,4 +1,4 @@
-"""Solvers and bounds by the names that a user types."""
+"""Solvers and bounds by their names on the command line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _SCENE_OPTIONS = dict.fromkeys(
 # Options of RANSAC for synthetic data. These thresholds are the best of a grid from (3 px, 0.15 m) to
 # (8 px, 0.4 m) on problems whose seed was not `DEFAULT_SEED`. Success varies by one percentage point over the grid.
 _PRIOR_OPTIONS = dict.fromkeys(("ransac-epnp-lm", "p3p-ransac"), "threshold=5,world_threshold=0.25")
-# Module and name of each optional package. The names of the package's solvers start with the key.
+# Maps the start of a solver's name to the module and the name of the package that the solver needs.
 _PACKAGES = {peer.source[1].lower(): peer.source for peer in (OpenCVPnP, KorniaRs, PoseLib, PyColmap)}
 
 
@@ -70,7 +70,7 @@ def load_solver(spec: str) -> nn.Module:
 
 
 def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic",)) -> list[str]:
-    """List the installed competitors and the bounds of the protocol by their names for :func:`load_solver`.
+    """List the names of the protocol's installed competitors and bounds. :func:`load_solver` accepts the names.
 
     Args:
         n: number of pairs per problem, or several such numbers.

@@ -43,7 +43,7 @@ themed = rc_context(THEME)  #: Decorator of functions that draw pictures.
 
 
 def make_figure(width: float, height: float, *heading: str) -> Figure:
-    """Make a white figure with a size in inches and a title of zero or more lines."""
+    """Make a white figure. The size is in inches, and each ``heading`` is a line of the title."""
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     if heading:
         figure.suptitle("\n".join(heading), x=0.01, ha="left")

@@ -29,12 +29,12 @@ PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] 
     "mixed": ("mixed", partial(MixedProblems, [SyntheticProblems, _slab])),
 }
 
-# Number of problems per batch. With a fixed number, a set of 100 problems is the start of a set of 1000 problems.
+# Number of problems per batch. The number is fixed, so that a set of 100 problems is the start of a set of 1000.
 _DRAW_BATCH = 1000
 
 
 def _read_outliers(text: str, n: int, mismatches_only: bool) -> Iterator[tuple[str, OutlierMix, str | int]]:
-    """Parse ``--outliers``. Yield a label, a mix, and ``none``, ``uniform`` or an integer for the results file."""
+    """Parse ``--outliers``. Yield labels, mixes, and entries of results files (``none``, ``uniform`` or an integer)."""
     one, many, share = ("mismatch", "mismatches", 1.0) if mismatches_only else ("outlier", "outliers", 0.5)
     for word in map(str.strip, text.split(",")):
         if word == "uniform":
@@ -76,9 +76,9 @@ def evaluation_sets(
         count: number of problems per set.
         seed: seed of the problems.
         metric: whether the scenes are in metres.
-        mismatches_only: make every outlier a mismatch with a pixel of its own. Otherwise, about half of the outliers
-            are mismatches, and the rest of the outliers have random pixels.
-        known_noise: give synthetic problems the standard deviations of the noise. Points and pixels do not change.
+        mismatches_only: make every outlier a mismatch, and let no two mismatches share a pixel. Otherwise, about half
+            of the outliers are mismatches, and the others have random pixels.
+        known_noise: add the standard deviations of the noise to synthetic problems. Points and pixels do not change.
         dtype: dtype of the problems, which are drawn in float64 and then converted.
 
     Returns:
@@ -113,7 +113,7 @@ def evaluation_sets(
                     prior, make = PRIORS[source]
                     problems = draw_problems(make(**options, **noise, batch_size=_DRAW_BATCH), count)
                     origin = {"source": prior}
-                else:  # mismatches get pixels of spare points; with `mismatches_only`, no two mismatches share one
+                else:  # mismatches get pixels of spare points; with `mismatches_only`, no two mismatches share a pixel
                     spares = max(1, mix.max_count(size)) if mismatches_only else 1
                     views = SceneProblems(scene, num_spares=spares, **options, batch_size=_DRAW_BATCH)
                     problems, origin = draw_problems(views, count), {"source": scene.name, "path": source}

@@ -82,7 +82,7 @@ def differences(before: Any, now: Any, place: str = "") -> list[str]:
 
 
 def resume(plan: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Fill ``plan``, which has no rows, with the rows of the file at ``path``. A missing file is ignored.
+    """Return ``plan`` with the rows and the environment of the file at ``path``. A missing file is ignored.
 
     If the file's code, versions, solvers or data sets differ from ``plan``, a ``ValueError`` names some differences.
     """

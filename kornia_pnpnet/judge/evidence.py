@@ -1,20 +1,20 @@
 r"""The evidence for a pose: how much likelier the pairs are with this pose than without a pose.
 
 The residual of an inlier is Gaussian. One inlier in ten has three times the standard deviation of the rest. The
-pixel of an outlier is uniformly distributed. Let :math:`w` be the share of inliers, and let :math:`s` multiply all
-variances. Let :math:`d_i(s)` be the density of pair :math:`i` as an inlier, divided by its density as an outlier. The
-log-likelihood ratio
+pixel of an outlier is uniformly distributed. Let :math:`w` be the share of inliers, and :math:`s` a factor of all
+inlier variances. Let :math:`d_i(s)` be the density of pair :math:`i` as an inlier, divided by its density as an
+outlier. The log-likelihood ratio is
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
-leaves out its three largest positive terms, because some pose fits any three pairs. The vote :math:`v_i` is the inverse
+minus the three largest positive logarithms, because any three pairs fit some pose. The vote :math:`v_i` is the inverse
 of the number of pairs with about the same pixel and point. Expectation-maximisation (EM) estimates :math:`w`. If the
 noise is unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1, 8, 64, ..., and larger values have
 lower prior probabilities.
 
 Let :math:`M` be the mean of :math:`\exp L(s)`, weighted by the prior probability of :math:`s`. The *evidence* is
 :math:`\log M - \log n - \log k`, where :math:`n` is the number of possible minimal samples, and :math:`k` the largest
-number of poses per sample. A pose is *believed* if its :func:`probability` suffices.
+number of poses per sample. A pose is *believed* if its :func:`probability` is at least :data:`LEAST_PROBABILITY`.
 
 The results have no gradient.
 """
@@ -60,7 +60,7 @@ _STEP = 8.0
 _SCALES = 6
 # If the caller gave the noise, `s = 8^k` has a prior log-probability of k times this number.
 _UNEXPECTED = -3.0
-# Number of EM rounds that estimate the share of inliers at each fixed `s`, and of final rounds that also estimate `s`.
+# Numbers of EM rounds: `_ROUNDS` estimate the share of inliers at each fixed `s`, `_FINAL_ROUNDS` also estimate `s`.
 _ROUNDS, _FINAL_ROUNDS = 4, 2
 # Real residuals have heavy tails: a share `_TAIL` of the inliers (the wide component) has `_WIDE` times the variance of
 # the rest. Without this component, success on indoor RGB-D matches falls by 2.5 percentage points.
@@ -72,8 +72,8 @@ _LEAST_SHARE = 3e-3
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Largest number of poses per minimal sample.
 _POSES = 4
-# To make equal rows adjacent, rows are sorted by a key: the sum of their entries times powers of this number. The
-# number is transcendental, so that different rows of integers have different keys.
+# To make equal rows adjacent, rows are sorted by a key: the sum of their entries times powers of this number. Because
+# the number is transcendental, different rows of integers have different keys.
 _KEY = math.pi / 4
 
 #: Least :func:`probability` of a believed pose. A Gaussian error is within two sigmas with about this probability.
@@ -100,10 +100,10 @@ class Votes(NamedTuple):
     """The quantities in the evidence that do not depend on the pose.
 
     Attributes:
-        pairs: votes (B, N). A vote is 1 over the number of copies of the pair (with the pair itself), or 0 for padding.
+        pairs: votes (B, N). A vote is 1 over the number of copies of the pair (including the pair), or 0 for padding.
         known: whether the caller gave any noise of the problem, bool (B, 1).
         outlier: density of an outlier's pixel, divided by the peak of the inliers' narrow component at a variance of
-            1 px², (B, 1). Inliers and outliers have equal shares here.
+            1 px², (B, 1). The value is for equal shares of inliers and outliers.
     """
 
     pairs: Tensor
@@ -113,7 +113,7 @@ class Votes(NamedTuple):
     @classmethod
     @torch.no_grad()
     def of(cls, problem: Problem, known: Tensor) -> Votes:
-        """Count the copies of pairs, and spread outliers over a square with the variance of the usual pairs' pixels."""
+        """Count copies of pairs. Outliers are uniform on a square of the same variance as the usual pairs' pixels."""
         there = problem.weights > 0
         cells = torch.cat((problem.img_points / (_PIXEL_CELL * problem.focal), problem.world_points / _POINT_CELL), -1)
         pairs = torch.where(there, copies(cells.round(), there).reciprocal(), 0.0)
@@ -129,12 +129,12 @@ class AtPose(NamedTuple):
     """The residuals of a problem at a pose.
 
     Attributes:
-        projection: the points projected at the pose.
-        exponent: -1/2 times the squared residual divided by the pixel's variance, (B, N). Points behind the camera have
-            about -∞.
+        projection: the points projected with the pose.
+        exponent: -1/2 times the squared residual divided by the pixel's variance, (B, N). The exponent is
+            about -∞ behind the camera.
         density: the square root of the determinant of ``precision``, (B, N) or (1, 1).
         outlier: ``Votes.outlier`` divided by ``density``, (B, N) or (B, 1).
-        precision: inverse variance, (B, N) or (1, 1), or inverse covariance of each pixel.
+        precision: inverse variance of each pixel, (B, N) or (1, 1), or inverse covariance.
     """
 
     projection: Projection
@@ -153,10 +153,9 @@ class Mixture(NamedTuple):
     """The distribution of the residuals of a problem.
 
     Attributes:
-        variance: number by which the variances of the inliers are multiplied, shape (B, 1). If ``problem.noise`` is
-            ``None``, the unit is px².
+        variance: factor of the inliers' variances, shape (B, 1). If ``problem.noise`` is ``None``, the unit is px².
         share: share of inliers, shape (B, 1).
-        least: lower bound of ``variance``, shape (B, 1). Without the bound, few pairs could make the variance 0.
+        least: lower bound of ``variance``, shape (B, 1). Without the bound, a few pairs could make the variance 0.
         total: sum of the votes, shape (B, 1).
     """
 
@@ -166,7 +165,7 @@ class Mixture(NamedTuple):
     total: Tensor
 
     def densities(self, exponent: Tensor, outlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Relative densities (B, N) of inliers, of inliers with a ninth of the wide component, and of outliers."""
+        """Relative densities (B, N) of inliers, of inliers with the wide component divided by 9, and of outliers."""
         # `exp2` is faster than `exp`. On a CPU (MKL), `exp` takes 50 times as long if the result underflows.
         scaled = exponent / (math.log(2.0) * self.variance)
         narrow, wide = scaled.exp2(), (scaled / _WIDE).exp2()
@@ -207,7 +206,7 @@ class Evidence(NamedTuple):
 
 @torch.no_grad()
 def copies(rows: Tensor, there: Tensor) -> Tensor:
-    """For each row of (B, N, C), count the equal rows that are ``there``, bool (B, N). Each count is at least 1."""
+    """For each row of (B, N, C), count equal rows whose ``there``, bool (B, N), is true. Each count is at least 1."""
     key = _KEY ** torch.arange(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     order = (rows * key).sum(-1).argsort(1)
     ordered = rows.gather(1, order[..., None].expand_as(rows))
@@ -256,7 +255,7 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
 
 
 def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
-    """Project the points at a pose, and standardise the residuals. With noise ``None``, a pixel's variance is 1 px²."""
+    """Project the points with a pose, and standardise the residuals. For noise ``None``, pixels have variance 1 px²."""
     projection = project(state, problem)
     sq_residual, precision = information(projection, problem)
     exponent = torch.where(projection.in_front, -0.5 * sq_residual, -(torch.finfo(sq_residual.dtype).max ** 0.5))
@@ -270,7 +269,7 @@ def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
 def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None = None) -> Mixture:
     """Run one round of EM. Problems that are ``frozen``, bool (B, 1), keep their variance.
 
-    ``None``: problems are frozen if the caller gave their noise.
+    ``frozen=None``: problems are frozen if the caller gave their noise.
     """
     exponent = seen.exponent.detach()
     inlier, weighted, outlier = mixture.densities(exponent, seen.outlier.detach())
@@ -286,12 +285,13 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 
 @torch.no_grad()
 def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, odds: Tensor | None = None) -> Tensor:
-    """Probability (B,) that the errors of a pose are at most 10 degrees and 30 % of the distance of the points.
+    """Probability (B,) of errors of at most 10 degrees (rotation) and 30 % of the points' distance (translation).
 
-    The result has three factors: a logistic function of the evidence and of log :func:`pose_sigma`, the probability
-    :func:`within_limits`, and the logistic function of ``odds`` (B,). ``odds`` are the log-odds of the pose against
-    other poses (``None``: no other poses). The result is 0 if almost all inliers' points lie on a line, or if the noise
-    is implausible, for example with mirrored pixels. If ``known`` (B, 1), noise up to the caller's noise is plausible.
+    The result has three factors. The first is a logistic function of the evidence and of log :func:`pose_sigma`. The
+    second is :func:`within_limits`. The third is the logistic function of ``odds`` (B,), the log-odds of the pose
+    against other poses (``None``: no other poses). The result is 0 if the points of almost all inliers lie on a line.
+    Implausible noise, for example of mirrored pixels, also gives 0. Where ``known`` (B, 1) is true, noise up to the
+    caller's noise is plausible.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
@@ -311,7 +311,7 @@ def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def within_limits(sigma: Tensor) -> Tensor:
-    """Probability, in float32, that a Gaussian error of the standard deviation ``sigma`` is between -1 and 1."""
+    """Probability, in float32, that a Gaussian error with standard deviation ``sigma`` is between -1 and 1."""
     return torch.erf(0.5**0.5 / sigma.float())
 
 
@@ -355,7 +355,7 @@ def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Sym
 
 
 def _form(matrix: Tensor, vector: Tensor) -> Tensor:
-    """The product v^T M^-1 v (B,) of symmetric matrices (B, 6, 6) and vectors (B, 6), by blocks of three."""
+    """The product v^T M^-1 v (B,) of symmetric matrices (B, 6, 6) and vectors (B, 6), from 3 x 3 blocks."""
     turn, cross, shift = matrix[:, :3, :3], matrix[:, 3:, :3], matrix[:, 3:, 3:]
     first, last = vector[:, :3, None], vector[:, 3:, None]
     solved = solve_symmetric(shift, torch.cat((cross, last), -1))
@@ -366,13 +366,13 @@ def _form(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
-    """Whether enough points (B, N, 3) of the inliers (B, N) lie off the line that fits them best, bool (B,).
+    """Whether enough points (B, N, 3) of the inliers (B, N) lie off their best-fitting line, bool (B,).
 
-    Points on a line leave one rotation free, so that a few outliers can determine this rotation by chance.
+    Points on a line leave one rotation free. A few outliers can determine this rotation by chance.
     """
     world, inliers = world_points.permute(2, 1, 0), inliers.mT  # (3, N, B) and (N, B)
     weights = there = inliers.to(world.dtype)
-    # Without inliers, or if all inliers are the same point, numbers are NaN, and the result is False.
+    # If no inlier exists, or if all inliers are one point, the numbers are NaN, and the result is False.
     for _ in range(_LINE_ROUNDS):
         share = weights / weights.sum(0)
         centred = world - (share * world).sum(1, keepdim=True)

@@ -1,8 +1,8 @@
 r"""Find the inliers of a pose by thresholds.
 
 A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
-:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point. The *standardised* squared
-residual is the left side divided by the right side.
+:math:`\tau` is in pixels. The threshold :math:`\omega` is in the unit of the world points. The *standardised* squared
+residual is the left side of the inequality divided by the right side.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
 
 
 def median_residual(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:
-    """Median (B, 1) of the squared residuals (B, N) where ``there`` (B, N) is true; infinite without such pairs.
+    """Median (B, 1) of the squared residuals (B, N) where ``there`` (B, N) is true; infinite if no entry is true.
 
     The median ignores the ``fitted`` smallest residuals, because a state can fit ``fitted`` pairs exactly.
     """

@@ -25,8 +25,8 @@ __all__ = ["find_alternatives", "reconsider"]
 _LIKELY = 1e-3
 # The logarithm of a likelihood ratio is clipped at this number, so that its exponential does not overflow.
 _LIKELIER = 30.0
-# Two poses are the same minimum if their rotations differ by less than _SAME radians, and the mean point moves in the
-# camera frame by less than _SAME times its distance from the camera.
+# Two poses are the same minimum if their rotations differ by less than _SAME radians, and their camera coordinates of
+# the mean point by less than _SAME times the distance of this point.
 _SAME = 0.035
 # A mirror image is refined if most inliers have residuals below this number times the spread of the inliers' pixels.
 _NEAR_MIRROR = 0.2
@@ -57,7 +57,7 @@ def find_alternatives(
     The refinement starts from the mirror image of the pose, from the P3P solutions of three pairs that lie far apart,
     and from the poses of ``starts``. When the camera sees a plane almost from the front, the mirror image can be nearly
     as likely as the pose without being a minimum. Therefore, if the refinement of the mirror image ends at the pose,
-    the unrefined mirror image is used. Problems that are not ``valid``, bool (B,), get no other poses.
+    the unrefined mirror image is used. Problems get no other poses where ``valid``, bool (B,), is false.
     """
     problem, starts, pose = map_tensors(torch.Tensor.detach, (problem, starts, pose))
     plan = refine.begin(problem, starts._replace(pose=pose, others=None, camera=None))
@@ -110,11 +110,11 @@ def reconsider(
 ) -> tuple[Progress, Evidence, Tensor]:
     """Compare refined poses with rivals. If ``refine.by_residual`` is positive, each problem keeps its likeliest pose.
 
-    If the noise is unknown and a larger noise is almost as likely, a rival starts from the refined pose with the
-    larger noise. If the mirror image of the pose has small residuals, a rival starts from the mirror image. If
-    ``replaced`` is ``None``, a given rival is used if its rotation differs from the pose's, unless nearly all pairs are
-    inliers of the pose. A given rival starts with the noise of its own residuals. If ``refine.by_residual`` is 0, only
-    mirror images and rivals in ``replaced`` are tried. Rivals over 10 degrees from the result lower its probability.
+    If a larger noise is almost as likely as the estimate, a rival starts from the refined pose and the larger noise. If
+    the mirror image of the pose has small residuals, a rival starts from the mirror image. If ``replaced`` is ``None``,
+    a given rival is ignored when its rotation is close to the refined rotation, or when nearly all pairs are inliers. A
+    given rival starts with the noise of its own residuals. If ``refine.by_residual`` is 0, only mirror images and
+    rivals selected by ``replaced`` are tried. Rivals rotated by over 10 degrees lower the result's probability.
 
     Args:
         refine: the refiner.
@@ -123,12 +123,12 @@ def reconsider(
         found: the evidence for the refined poses.
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
         rival: given rivals, for example of ``search_on``, or ``None``.
-        replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. Other given rivals are
-            ignored. ``None``: given rivals compete by their likelihoods.
+        replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. Given rivals that do not
+            replace a pose are ignored. ``None``: given rivals compete by their likelihoods.
 
     Returns:
         The arguments of :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for the
-        states, and the log-odds against rivals over 10 degrees away. Without such rivals, the log-odds are infinite.
+        states, and the log-odds against rivals over 10 degrees away (infinite without such rivals).
     """
     problem, by_residual, pose = plan.problem, now.mixture is not None, now.state.pose
     with torch.no_grad():
@@ -155,7 +155,7 @@ def reconsider(
         return now, found, torch.full_like(found.log_ratio, torch.inf)
     state, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
     every = taken(plan._replace(state=now.state, starts=1), owners)
-    # A given rival, the last kind, starts with the noise of its own residuals.
+    # The last kind is a given rival, which starts with the noise of its own residuals.
     given = kind[:, None] == len(kinds) - 1
     mixture = map_tensors(lambda x, y: torch.where(given, x, y), every.evidence_at(state).mixture, mixture)
     tried = Progress.of(state, mixture)

@@ -8,9 +8,9 @@ the same in the world frame and in the camera frame. Here :math:`c_0` is the cen
 The projection equations are :math:`\sum_j a_{ij} (x_j - u_i z_j) = 0` and :math:`\sum_j a_{ij} (y_j - v_i z_j) = 0`.
 For given depths :math:`z` of the control points, the least-squares solutions are :math:`x = P z` and :math:`y = Q z`,
 with :math:`P = \sum_i w_i u_i a_i a_i^\top` and :math:`Q = \sum_i w_i v_i a_i a_i^\top`. Of the paper's 12 unknowns,
-only the four depths remain. The algebraic error of the depths is :math:`z^\top K z`. The columns of :math:`D(z)` and of
-:math:`L` are the control vectors in the camera frame and in the world frame. If :math:`D^\top D = L^\top L`, a rotation
-or a reflection maps :math:`L` to :math:`D`. An array (4, C, B) contains the four depths of C candidates.
+only the four depths remain. The algebraic error of the depths is :math:`z^\top K z`. The control vectors are the
+columns of :math:`D(z)` in the camera frame, and of :math:`L` in the world frame. If :math:`D^\top D = L^\top L`, a
+rotation or a reflection maps :math:`L` to :math:`D`. An array (4, C, B) contains the four depths of C candidates.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
 # Size of the ridge of `_null_space`, divided by the squared spread of the pixels. If null vectors have equal errors,
-# the ridge sorts them by the extent of the world, longest first.
+# the ridge sorts them by the extent of the world, in descending order.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
@@ -56,7 +56,7 @@ class ControlPoints(NamedTuple):
 def control_points(problem: Problem) -> ControlPoints:
     r"""Choose the control points by weighted Gram-Schmidt on the coordinates of the world points.
 
-    Each of three steps selects the coordinate with the largest variance, and makes the others orthogonal to the chosen
+    Each of three steps selects the coordinate of largest variance, and makes all other coordinates orthogonal to this
     one. Pairs with weight 0 are ignored. (The paper's principal directions have no gradient if two extents are equal.)
 
     Example:
@@ -95,20 +95,20 @@ class EPnP(Initialiser):
 
     The control points in the camera frame are a combination of the null vectors of the projection equations. The
     coefficients have to preserve the distances between the control points. Gauss-Newton starts from four cases, which
-    combine one, two, three and four null vectors. The case with the smallest weighted reprojection error is aligned
-    with the world by orthogonal Procrustes.
+    combine one, two, three and four null vectors. Orthogonal Procrustes aligns the case of the smallest weighted
+    reprojection error with the world.
 
     Source: V. Lepetit, F. Moreno-Noguer and P. Fua, "EPnP: An Accurate O(n) Solution to the PnP Problem", IJCV 2009.
     Four things differ from the paper. Two thirds of the unknowns are eliminated (see the module). The centroid has
     depth 0 in all but one null vector. The objective includes the algebraic error, and does not depend on the choice of
     the control points. Planar points use the same equations, with 0 as the last control vector.
 
-    Four or five pairs can have up to four solutions. The solution with the least reprojection error may then be
-    incorrect. A problem is not ``ok`` if it has fewer than four pairs, if its points lie on a line, or if fewer than
-    three pairs are in front of the camera. The gradient of the pose follows from the implicit function theorem.
+    Four or five pairs can have up to four solutions, and the solution of the least reprojection error may be incorrect.
+    A problem is not ``ok`` if it has fewer than four pairs, if its points lie on a line, or if fewer than three pairs
+    are in front of the camera. The gradient of the pose follows from the implicit function theorem.
 
     Args:
-        iterations: number of Gauss-Newton steps of the best case, at least 2. Each other case takes two steps.
+        iterations: number of Gauss-Newton steps of the best case, at least 2. All other cases take two steps.
         algebraic_weight: :math:`\mu \ge 0`, weight of the algebraic error relative to the squared error of the
             distances, in a world with a root mean square radius of 1. The paper's weight is 0.
 
@@ -162,7 +162,7 @@ class EPnP(Initialiser):
         return Starts(Pose(rotation, translation), torch.ones_like(problem.weights), ok)
 
     def _depths(self, system: _DepthSystem) -> tuple[Tensor, Tensor]:
-        """Depths (4, 1, B) of the best case, and whether the case is valid (B,). If not, points have equal depths."""
+        """Depths (4, 1, B) of the best case, and its validity (B,). All points of an invalid case have equal depths."""
         cases = _four_cases(system).detach()  # `no_grad` does not stop forward-mode derivatives
         # A shape and its mirror image along the optical axis have equal distances between points. Gauss-Newton cannot
         # move from one shape to the other shape, and therefore starts from both shapes.
@@ -216,7 +216,7 @@ def _in_camera(system: _DepthSystem, depths: Tensor) -> Tensor:
 
 
 def _null_space(system: _DepthSystem) -> Tensor:
-    """A basis v (4, 4 vectors, B) of the depths z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄ that makes K nearly diagonal.
+    """The basis v (4, 4 vectors, B) that makes K nearly diagonal. The depths are z = β₁v₁ + β₂v₂ + β₃v₃ + β₄v₄.
 
     The centroid has the depth 1 in v₁, and the depth 0 in v₂, v₃ and v₄. The algebraic errors of v₂, v₃ and v₄ ascend.
     """
@@ -266,7 +266,7 @@ def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Ten
 
 
 def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
-    r"""Minimise :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` by Gauss-Newton; the paper has six distances."""
+    r"""Minimise :math:`\|D^\top D - L^\top L\|_F^2 + \mu\, z^\top K z` by Gauss-Newton (paper: six distances)."""
     for _ in range(iterations):
         normal, gradient, _ = _normal_equations(system, depths)
         (step,) = solve_leading([row.unbind(0) for row in normal.unbind(0)], gradient.unbind(0), (4,))
@@ -277,7 +277,7 @@ def _minimize(system: _DepthSystem, depths: Tensor, iterations: int) -> Tensor:
 def _attach_gradient(system: _DepthSystem, depths: Tensor, planar: Tensor) -> Tensor:
     r"""Attach gradients to minima (4, 1, B) by the implicit function theorem. Gradients of degenerate minima are 0.
 
-    Two Newton steps with a constant matrix make first and second derivatives exact. The values do not change.
+    Two Newton steps with a constant matrix make first and second derivatives exact. The minima do not change.
     """
     with torch.no_grad():
         normal, _, misfit = _normal_equations(system, depths)

@@ -47,8 +47,8 @@ def propose(
     Args:
         init: the initialiser, or ``None`` if the refinement starts from the given pose.
         problem: the problem.
-        given: the caller's pose in the frame of the problem. This pose competes with the initialiser's poses.
-        views: number of views. For rigs, and for initialisers that accept a given pose, this argument has no effect.
+        given: the caller's pose in the frame of the problem. A given pose competes with the initialiser's poses.
+        views: number of views. ``views`` has no effect for rigs, and for initialisers that accept a given pose.
         order: see :func:`~kornia_pnpnet.propose.views.from_views`.
         fixed: whether the number of samples for a rig is fixed, as compiled and exported graphs require.
         search_follows: see :meth:`~kornia_pnpnet.propose.set.SetInit.forward`.

@@ -31,7 +31,7 @@ _WIDTH = 0.5 * math.log(_LONGEST / _SHORTEST)
 _HALF_WIDTH = math.sqrt(2.0)
 # If the caller expects a focal length, half the range of log f is this number of standard deviations.
 _SEARCHED = 2.0
-# Inlier threshold in pixels of the normalised camera. At the middle focal length, it is 0.65 % of half the image width.
+# Inlier threshold in pixels of the normalised camera: 0.65 % of half the image width at the middle focal length.
 _THRESHOLD = 10.0
 _FINDER = RANSAC(P3P(), threshold=_THRESHOLD, confidence=0.99, final_steps=3)
 # RANSAC for problems that the refinement did not solve. Further iterations of the refinement follow.
@@ -41,18 +41,18 @@ _STEPS = 14
 # Lower bound, in focal lengths, of the kernel's scale in the first step. For example, a distortion of k1 = 0.2 shifts a
 # pixel at a radius of 0.7 by 0.2 * 0.7^3 = 0.07.
 _WIDE = 0.07
-# After each step, this lower bound is multiplied by _SHRINK, but never falls below _LEAST.
+# After each step, the lower bound of the scale is multiplied by _SHRINK, but never falls below _LEAST.
 _SHRINK, _LEAST = 0.6, 1e-5
 
 
 def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> Inputs:
     """Replace each focal length by the middle of the searched range, and describe this range in ``free_focal``.
 
-    If ``sigma``, the standard deviation of log f, is given, the range lies around the caller's focal length. Otherwise
-    the range is proportional to the size of the image. The size is twice the principal point or, if larger, an estimate
-    from the median distance of the pixels from the principal point. The aspect ratio and the signs of fx and fy are
-    kept. Matrices that are not pinhole cameras become NaN. ``radial`` is the number of coefficients of radial
-    distortion to estimate.
+    If ``sigma`` (the standard deviation of log f) is given, the range lies around the caller's focal length. Otherwise
+    the range is proportional to the size of the image. The size is the larger of two estimates: twice the principal
+    point, and a multiple of the median distance of the pixels from the principal point. The aspect ratio and the signs
+    of fx and fy are kept. Matrices that are not pinhole cameras become NaN. ``radial`` is the number of coefficients of
+    radial distortion to estimate.
     """
     camera, is_pinhole = pinholes(inputs.intrinsics)
     given = focal_length(camera)  # (B,)
@@ -67,7 +67,7 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> 
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
         nominal = expected = math.sqrt(_SHORTEST * _LONGEST) * half
-        width, precision = _WIDTH, 0.0 if radial else None  # a prior of the distortion needs a number here
+        width, precision = _WIDTH, 0.0 if radial else None  # with `None`, the distortion would have no prior
     else:
         nominal, expected = given.detach(), given
         width, precision = min(_SEARCHED * sigma, _WIDTH), sigma**-2
@@ -83,7 +83,7 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
 
 
 def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
-    """Estimate the focal lengths, and the poses if the caller gave no poses.
+    """Estimate the focal lengths. If the caller gave no poses, also estimate the poses.
 
     RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length. If
     ``radial`` is not 0, distortion is also estimated and removed. ``inputs`` come from :func:`with_nominal_focal`.
@@ -114,9 +114,9 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
 
 @torch.no_grad()
 def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, Tensor]:
-    """Run RANSAC on ``doubted`` problems, bool (B,), and replace their states where RANSAC finds a pose.
+    """Run RANSAC where ``doubted``, bool (B,), is true, and replace the states for which RANSAC finds a pose.
 
-    A problem is doubted if its refined pose is not ``ok``. Also returns where RANSAC found a pose, bool (B,).
+    A problem is doubted if its refined pose is not ``ok``. Also returns whether RANSAC found a pose, bool (B,).
     """
     rows = doubted.nonzero()[:, 0]
     if not len(rows):

@@ -18,8 +18,8 @@ class Initialiser(Configured):
     Any module with this ``forward`` is an initialiser. If a module lacks an attribute, this class gives the default.
 
     Attributes:
-        pairs_at_once: on a CPU and without gradients, solvers split a batch into parts that fit the CPU's caches. This
-            attribute is the largest number of pairs in a part, per thread. If ``None``, batches are not split.
+        pairs_at_once: largest number of pairs per part and thread, or ``None`` for no split. On a CPU and without
+            gradients, solvers split a batch into parts that fit the CPU's caches.
         fixed_pairs: whether the number of pairs has to be ``config["n"]``.
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.

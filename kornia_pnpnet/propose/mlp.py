@@ -41,7 +41,7 @@ def _run(layers: nn.Sequential, hidden: Tensor) -> Tensor:
 def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
     """Rotations (B, 3, 3) about axes (3, B) by angles (B,) in radians. The axes need not have length 1."""
     limits = torch.finfo(axis.dtype)
-    # The added epsilon keeps the gradient finite if the network returns the axis 0.
+    # The added epsilon keeps the gradient finite if the network returns a zero vector as axis.
     vector = axis * (angle * ((axis * axis).sum(0) + limits.eps).rsqrt())
     length = (vector * vector).sum(0).clamp(min=limits.tiny).sqrt()
     # The quaternion (w, xyz) has the length √2.

@@ -8,15 +8,15 @@ length of the difference of the unit rays :math:`i` and :math:`j`. The law of co
 
 If weights :math:`u` satisfy :math:`a \cdot u = 0`, the weighted sum of the three equations is a conic in the ratios of
 the distances. Let :math:`s_k` be the squared sine of the angle between the rays :math:`i` and :math:`j`. Let :math:`g`
-be the squared determinant of the matrix of the three rays. Then the conic is a pair of lines when
+be the squared determinant of the matrix of the three rays. The conic is a pair of lines when
 
 .. math:: (u_1 u_2 + u_2 u_3 + u_3 u_1)\,(s \cdot u) = g\, u_1 u_2 u_3.
 
-One root of this cubic gives two lines. Each line intersects a second conic, which has other weights, in two points. A
+One root of this cubic equation gives two lines. Each line intersects a second conic (other weights) in two points. A
 Newton step then refines the ratios of the distances.
 
-The last dimension of every tensor has the C problems of a chunk. Finite values are selected by ``lerp`` with a weight
-of 0 or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
+The last dimension of every tensor has the C problems of a chunk. ``lerp`` with the weight 0 or 1 selects finite values.
+On a CPU, ``torch.where`` is ten times slower if its mask is unpredictable.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ _CLOSE = 64.0
 _LINE = 32.0
 # Number of Newton steps for the root of the cubic. The steps reduce a relative error of 37 % to float64 rounding.
 _CUBIC_STEPS = 4
-# The Newton step for the ratios of the distances is damped if the squared determinant of the step's linear system is
-# below eps^_DAMPING_POWER times the product of two squared edges. When two solutions nearly coincide, rounding errors
-# would dominate the full step.
+# The Newton step of `_refined` is damped if the squared determinant of its linear system is below eps^_DAMPING_POWER
+# times the product of two squared edges. When two solutions nearly coincide, rounding errors would dominate an undamped
+# step.
 _DAMPING_POWER = 1.25
 # Number of focal lengths at which `P3P` solves a sample if the focal length is unknown.
 _FOCALS = 12
@@ -87,9 +87,9 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 
 
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the real root ``u : v`` that is farthest from the other two roots of a cubic form with coefficients (4, C).
+    """Of a cubic form with coefficients (4, C), find the real root ``u : v`` that is farthest from the other two roots.
 
-    If two solutions of P3P nearly coincide, two roots also do. The third root gives a line through both solutions.
+    Two nearly equal solutions of P3P give two nearly equal roots. The third root gives a line through both solutions.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -146,9 +146,9 @@ def _lines(u: Tensor, h: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
-    """Distances (3, 2, 2, C), up to scale, where two lines intersect the conic with the weights ``v`` (3, C).
+    """Distances (3, 2, 2, C), up to scale, at the intersections of two lines and the conic of the weights ``v`` (3, C).
 
-    If a line touches or misses the conic, the distances of its second intersection are 0.
+    Axes: point, intersection, line. If a line touches or misses the conic, its second intersection has distances 0.
     """
     v1, v2, v3 = v
     vh1, vh2, vh3 = v * h
@@ -367,7 +367,7 @@ def p3p(world_points: Tensor, plane_points: Tensor) -> Hypotheses:
         :mod:`kornia_pnpnet.refine.residual`).
 
     Raises:
-        ShapeError: when a tensor has another shape, or the batches differ.
+        ShapeError: when a shape is incorrect, or the batches differ.
         TypeCheckError: for booleans or complex numbers.
         DeviceError: for tensors on two devices.
 
@@ -414,7 +414,7 @@ class P3P(Configured):
         super().__init__(locals())
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Four slots per sample and tried focal length. See MinimalSolver.hypotheses."""
+        """Four slots for each sample at each focal length of the grid. See MinimalSolver.hypotheses."""
         world, plane = problem.world_points, problem.img_points / problem.focal
         if problem.free_focal is None:
             entries, valid = minimal_poses(world, plane)

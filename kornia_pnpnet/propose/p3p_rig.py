@@ -113,7 +113,7 @@ def _starts(
     low, high = torch.maximum(*lows).clamp(min=0.0), torch.minimum(*highs)
     real = high > low
     middle, half = 0.5 * (low + high), torch.where(real, 0.5 * (high - low), 0.0)
-    # At an end of the interval, d_2 and d_3 behave like square roots. As functions of arcsin(`turn`), both are smooth.
+    # d_2 and d_3 behave like square roots at an end of the interval, but are smooth functions of arcsin(`turn`).
     turn = torch.linspace(-0.5 * math.pi, 0.5 * math.pi, _DISTANCES, dtype=sq_side.dtype, device=device).sin()[:, None]
     distances = middle + half * turn  # (D, B)
     signs = torch.tensor([-1.0, 1.0], dtype=sq_side.dtype, device=device)[:, None, None]

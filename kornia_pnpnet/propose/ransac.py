@@ -26,7 +26,7 @@ __all__ = ["RANSAC", "search_on"]
 # A pose can fit this number of inliers closely even if the pixels are noisy.
 _FITTED = 5
 # Largest residuals of an inlier in `search_on`, in standard deviations. The first limit is for noise that a network
-# estimates. Such estimates are too small when most pairs are outliers. The second limit is for the caller's noise.
+# estimates. Networks underestimate the noise when most pairs are outliers. The second limit is for the caller's noise.
 _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # For an unknown focal length, the inlier threshold is at least the product of this number, half the range of log f, and
 # the median distance of the pixels from the principal point. The number was tuned on random problems with fields of
@@ -36,7 +36,7 @@ _GRID_RESIDUAL = 0.04
 # depth, in units of the normalised world.
 _NEAREST = 0.5
 # _DOUBT is the chance that a pair of weight 0 is drawn, divided by the chance for weight 1. _LEAST_TRUST is this ratio
-# for confidences 0 and 1. The second ratio is smaller, because confidences are more reliable than a network's weights.
+# for confidences 0 and 1. _LEAST_TRUST is smaller, because confidences are more reliable than a network's weights.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
 
 
@@ -44,15 +44,15 @@ class RANSAC(Initialiser):
     r"""Find the pose with the best score among the poses of many samples, and improve this pose on its inliers.
 
     The samples of all problems are solved as one batch, in rounds. If a round finds a better pose, least squares on
-    the inliers improve this pose (LO-RANSAC). The search of a problem ends when, with probability ``confidence``, at
-    least one drawn sample has no outlier. If a problem has at most ``max_samples`` possible samples, no sample is drawn
-    twice. All problems and calls share the same random numbers. Except for rounding, the result of a problem therefore
-    does not depend on the batch. Pairs of a large confidence are drawn more often than other pairs.
+    the inliers improve this pose (LO-RANSAC). The search of a problem ends when the probability of at least one sample
+    without outlier reaches ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
+    drawn twice. All problems and calls use the same random numbers. Except for rounding, the result of a problem
+    therefore does not depend on the batch. Pairs with a larger confidence are drawn more often.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
-    least squares, the weight of an inlier is :math:`\tau^2` divided by the right-hand side. The final steps multiply
-    this weight by the weight of a Cauchy kernel. These steps start from a detached pose close to the minimum, and have
-    gradients with respect to points, pixels and weights. The choice of inliers and the first factor have no gradient.
+    least squares, an inlier has a weight without gradient: :math:`\tau^2` divided by the limit of :math:`\|r\|^2`. The
+    final steps also use the weights of a Cauchy kernel. The final steps start from a detached pose close to the
+    minimum, and have gradients with respect to points, pixels and weights. The choice of inliers has no gradient.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive
@@ -68,8 +68,8 @@ class RANSAC(Initialiser):
         max_samples: largest number of samples of a problem.
         min_samples: smallest number of samples of a problem. Noise can make the pose of a single sample inaccurate.
         confidence: required probability that at least one sample has no outlier, in (0, 1).
-        final_steps: number of least-squares steps from the best pose. 0 steps suffice before a refinement, but then
-            the pose has no gradient.
+        final_steps: number of least-squares steps from the best pose. 0 steps suffice before a refinement, but leave
+            the pose without gradient.
         seed: seed of the random numbers.
 
     Raises:
@@ -184,7 +184,7 @@ def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
     """Weights (B, N) of a Cauchy kernel. The inliers' median residual gives the scale, because thresholds are wide."""
     there = inliers > 0
     sq_scale = cauchy_scale(errors, there).clamp(min=torch.finfo(errors.dtype).eps)
-    # With few inliers, the median residual underestimates the noise, so that all weights are set closer to 1.
+    # With few inliers, the median residual underestimates the noise. All weights are then moved toward 1.
     count = there.sum(-1, keepdim=True, dtype=errors.dtype)
     return 1.0 / (1.0 + (count - _FITTED).clamp(min=0) / count.clamp(min=1) * errors / sq_scale)
 
@@ -193,7 +193,7 @@ _FURTHER = RANSAC(P3P(), min_samples=64)
 
 
 def _trusted(problem: Problem) -> Tensor:
-    """Relative chances (B, N) that pairs are drawn, from the caller's confidences."""
+    """The caller's confidences as relative chances (B, N) of drawing pairs."""
     if problem.confidence is None:
         return torch.ones_like(problem.weights)
     return _LEAST_TRUST + (1.0 - _LEAST_TRUST) * problem.confidence.nan_to_num(0.5)
@@ -203,14 +203,14 @@ def _trusted(problem: Problem) -> Tensor:
 def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, State]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    Least squares improve the best pose of the starts. A problem is searched only if the inliers of this pose require
-    more than 64 samples for a confidence of 0.999. Let :math:`w` be the weight of a pair in the starts. The chance that
-    this pair is drawn is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
+    Least squares improve the best pose of the starts. A problem is searched only if the inliers of the improved pose
+    require over 64 samples for a confidence of 0.999. Let :math:`w` be the weight of a pair in the starts. The chance
+    of drawing this pair is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
     A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
     limit is five standard deviations. If the caller gave no noise, the standard deviation of every pair is the mean of
-    the estimates. Noise of points is converted to pixels at the depth of the world's origin in the first pose. If
-    each pose used its own depths, a pose close to the points would have the most inliers.
+    the estimates. The noise of points is converted to pixels at one depth: the depth of the world's origin in the first
+    pose. If each pose used its own depths, a pose close to the points would have the most inliers.
 
     Args:
         problem: normalised problems of a centred and scaled world.

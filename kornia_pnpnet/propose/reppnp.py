@@ -1,6 +1,6 @@
 r"""EPPnP and REPPnP: a pose from the null space of the projection equations. REPPnP also rejects outliers.
 
-A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. The residuals are the algebraic
+A pair gives two equations, :math:`X_i - u_i Z_i = 0` and :math:`Y_i - v_i Z_i = 0`. The left sides are the algebraic
 errors. The unknowns are the camera coordinates of four control points (see :mod:`kornia_pnpnet.propose.epnp`). In an
 array ``rows`` (B, K + 1, 2 N), the first K rows hold the derivatives of the errors with respect to K unknowns, and the
 last row holds the errors. In each row, N entries for u precede N entries for v.
@@ -34,27 +34,27 @@ _MIN_PAIRS = 4
 # Ridges on the depths of the control vectors during and after outlier rejection. In the final pose, a large ridge would
 # suppress the small depths of a narrow view.
 _DEPTH_PRIOR, _FINAL_DEPTH_PRIOR = 5e-3, 1e-5
-# This number is added to 1 minus the leverage of a pair, because the leverage can be 1.
+# This number is added to (1 - leverage) of a pair, because the leverage can be 1.
 _LEVERAGE_RIDGE = 1e-6
 
 
 class REPPnP(Initialiser):
     r"""A pose from the null space of the projection equations, with outlier rejection by the algebraic error.
 
-    Each iteration finds the null vector of the kept pairs. Then a pair is kept if its algebraic error is at most
-    :math:`\max(Q, \delta_{\max})`, where :math:`Q` is a quantile of the errors. The first iteration uses all pairs. The
+    Each iteration finds the null vector of the kept pairs, and then keeps pairs with algebraic errors of at most
+    :math:`\max(Q, \delta_{\max})`. Here :math:`Q` is a quantile of the errors. The first iteration uses all pairs. The
     last null vector is aligned with the world by orthogonal Procrustes. Without rejection the method is EPPnP.
 
     Source: L. Ferraz, X. Binefa and F. Moreno-Noguer, "Very Fast Solution to the PnP Problem with Algebraic Outlier
     Rejection", CVPR 2014. Our changes raise the success rate or allow batches:
 
     - The null vector is scaled so that the centroid has depth 1. (In the paper, the vector has length 1.) The vector
-      solves a linear system, and does not depend on the control points, the frame or the unit. A small ridge pulls all
-      points toward the depth of the centroid, which reduces the effect of outliers.
+      solves a linear system, and does not depend on the control points, the frame or the unit. To reduce the effect of
+      outliers, a small ridge pulls all points toward the depth of the centroid.
     - Outliers are rejected by their leave-one-out error. The quantile is 50 % (paper: 25 %).
     - A second loop fits a rigid motion by Gauss-Newton on the algebraic error, and rejects outliers of this motion. The
-      final pose minimises the error. The paper's loop alternates between a rigid motion and a combination of four null
-      vectors.
+      final pose minimises the algebraic error. The paper's loop alternates between a rigid motion and a combination of
+      four null vectors.
     - Both loops have a fixed length. The paper's loop stops when the quantile no longer decreases.
 
     The selection of pairs has no gradient. The last Gauss-Newton steps start from a detached pose, and their gradient
@@ -134,7 +134,7 @@ class REPPnP(Initialiser):
         return Starts(pose, kept.to(problem.weights.dtype), ok)
 
     def _select(self, pairs: _Pairs, control: ControlPoints) -> tuple[Tensor, Pose]:
-        """Return weights, which are 0 for outliers, and the pose of the kept pairs in the frame of :class:`_Pairs`."""
+        """Return weights (0 for outliers), and the pose of the kept pairs in the frame of :class:`_Pairs`."""
         coordinates = control.coordinates.mT.contiguous()  # (B, 4, N)
         # Subtracting the mean from the pixels is a shear of the camera frame. The shear does not change the algebraic
         # errors. In a narrow view, the shear reduces rounding errors.
@@ -196,7 +196,7 @@ def _inverse(normal: Tensor, ridge: Tensor | float = 0.0) -> Tensor:
 
 
 def _null_vector(rows: Tensor, weights: Tensor, depth_prior: float) -> tuple[Tensor, Tensor]:
-    """Inverse normal matrix (B, 11, 11), and null vector (B, 12, 1). The last entry, the centroid's depth, is 1."""
+    """Inverse normal matrix (B, 11, 11), and null vector (B, 12, 1). The centroid's depth (last entry) is 1."""
     normal = _normal_matrix(rows, weights)
     inverse = _inverse(normal, depth_prior * (torch.arange(11, device=normal.device) >= 8).to(normal))
     return inverse, torch.cat((-(inverse @ normal[..., -1:]), torch.ones_like(normal[:, :1, :1])), 1)
@@ -224,8 +224,8 @@ def _step(pose: Pose, normal: Tensor) -> Pose:
 def _leave_one_out(rows: Tensor, inverse: Tensor, pairs: _Pairs, weights: Tensor) -> Tensor:
     r"""Squared leave-one-out errors :math:`e^\top (1 \mp w H)^{-1} e` (B, N) with the leverage :math:`H`.
 
-    If a kept pair is removed (minus), or a rejected pair is added (plus), the cost changes. The error is this change
-    divided by the weight :math:`w` of the pair.
+    If a kept pair is removed (minus), or a rejected pair is added (plus), the cost changes. The error is the change of
+    the cost, divided by the weight :math:`w` of the pair.
     """
     jacobian, count = rows[:, :-1], weights.shape[-1]
     solved = inverse @ jacobian

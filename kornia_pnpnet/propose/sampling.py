@@ -16,7 +16,7 @@ from kornia_pnpnet.problem import Problem
 
 __all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "ranked", "samples_needed", "spread_evenly"]
 
-# For each pair, _NEIGHBOURS nearest neighbours among at most _CANDIDATES pairs are compared, so that the cost is linear
+# The _NEIGHBOURS nearest neighbours of a pair are found among at most _CANDIDATES pairs. The cost is therefore linear
 # in the number of pairs. _CANDIDATES is a power of two because of the bit masks.
 _NEIGHBOURS, _CANDIDATES = 16, 512
 # The bits of the float32 infinity, read as an integer.
@@ -39,7 +39,7 @@ def kept_at_once(count: int, like: Tensor) -> int:
 def ranked(problem: Problem, present: Tensor) -> Tensor:
     """Find positions (B, N) that sort the pairs by their pixels and points. Absent pairs come last.
 
-    If a search takes the pairs in this order, its poses do not depend on the order in which the caller gave the pairs.
+    If a search takes sorted pairs, its poses do not depend on the caller's order of the pairs.
     """
     u, v = problem.img_points.double().unbind(-1)  # in float32, rounding makes keys equal
     keys = u + _RANK[0] * v + _RANK[1] * problem.world_points.square().sum(-1)
@@ -48,7 +48,7 @@ def ranked(problem: Problem, present: Tensor) -> Tensor:
 
 @torch.no_grad()
 def spread_evenly(present: Tensor, count: int) -> Tensor:
-    """Indices (B, count) of evenly spread present pairs. If fewer than ``count`` are present, absent pairs follow.
+    """Indices (B, count) of present pairs, evenly spread. If fewer than ``count`` are present, absent pairs follow.
 
     Multiples of the golden ratio shift the positions slightly, so that the selection does not follow a periodic pattern
     in the order of the pairs. No position occurs twice, unless the problem has fewer than ``count`` pairs.
@@ -90,7 +90,7 @@ def agreement_of_neighbours(world_points: Tensor, img_points: Tensor, there: Ten
 
     An inlier has neighbours that are common to image and world. An outlier has common neighbours only by chance. A
     common neighbour of rank :math:`a` in the image and rank :math:`b` in the world adds :math:`1 / (1 + \max(a, b))` to
-    the agreement. Pairs with equal pixels or points do not count, because they often repeat one incorrect match.
+    the agreement. Neighbours with an equal pixel or point do not count, because they often repeat one incorrect match.
 
     Source: J. Bian et al., "GMS: Grid-based motion statistics for fast, ultra-robust feature correspondence", CVPR 2017
     (the idea, for matches between two images).
@@ -199,7 +199,7 @@ def samples_needed(inliers: Tensor, counts: Tensor, size: int, confidence: float
     r"""Number of samples needed for a probability ``confidence`` that at least one sample has no outlier, float64 (B,).
 
     The number is :math:`\log(1-p) / \log(1-w)` for the confidence :math:`p`. The share of samples without an outlier is
-    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs. Both counts may be fractions.
+    :math:`w = \binom{k}{s} / \binom{c}{s}` for :math:`k` inliers of :math:`c` pairs. Fractional counts are allowed.
     Source: M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981, section II.B.
     """
     drawn = torch.arange(size, dtype=torch.float64, device=inliers.device)

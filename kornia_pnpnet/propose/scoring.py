@@ -5,7 +5,7 @@ A pixel :math:`b` and a point :math:`(x, y, z)` in the camera frame have the sta
 .. math:: e = \frac{(x - z\,b_u/f)^2 + (y - z\,b_v/f)^2}{(z \tau / f)^2 + \omega^2}
 
 The definition is in :mod:`kornia_pnpnet.judge.inliers`. Here, numerator and denominator are multiplied by
-:math:`(z/f)^2`. One matrix product projects all points at all poses.
+:math:`(z/f)^2`. One matrix product projects all points with all poses.
 """
 
 from __future__ import annotations
@@ -111,9 +111,9 @@ class Scene(NamedTuple):
         return losses
 
     def errors(self, poses: Tensor) -> Tensor:
-        """Standardised squared residuals (P, N, H) of every pair at every pose (P, 12, H), at most MAX_ERROR.
+        """Standardised squared residuals (P, N, H) of every pair for every pose (P, 12, H), at most MAX_ERROR.
 
-        A point behind the camera gets MAX_ERROR by a penalty on its depth, which is faster than a mask.
+        A penalty on the depth gives points behind the camera MAX_ERROR. A mask would be slower.
         """
         rows = self.rows.flatten(1, 2)
         x, y, z = torch.baddbmm(rows[..., 12:], rows[..., :12], poses).unflatten(1, self.rows.shape[1:3]).unbind(1)

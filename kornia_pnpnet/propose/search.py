@@ -36,18 +36,18 @@ _SAMPLES_AT_ONCE = 8192
 # A round has _GROWTH times the samples of all earlier rounds, but at least `min_samples` and at most _LARGEST_ROUND.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
 # A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds, or if at most _FEW_SAMPLES are left.
-# With few pairs, the pose then does not depend on the order of pairs, and rounding does not decide when a search ends.
+# If all samples are drawn, the pose does not depend on the order of pairs, and rounding does not decide when to stop.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
 # After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, but at least _FIRST_PAIRS. If k
-# samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Then 3 / w pairs
-# contain at least one inlier with a probability of 95 %.
+# samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Among 3 / w pairs,
+# at least one is an inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
-# After each scoring of a round, the best half of the poses is scored again on four times as many pairs. If fewer poses
+# After each scoring of a round, the best half of the poses is scored again by four times as many pairs. If fewer poses
 # were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
 _KEPT_ONE_IN, _MORE = 2, 4
 # If (slots for poses) x (pairs) is at most this number, scoring the empty slots is faster than removing them.
 _FEW_RESIDUALS = 4096
-# Number of poses with the smallest losses that each round improves. The best improved pose is then improved again.
+# Each round improves the _IMPROVED poses of smallest loss. The best improved pose is then improved again.
 _IMPROVED = 3
 # Samples are solved in multiples of this number, so that they fill the vector registers of a processor.
 _VECTOR = 64
@@ -58,14 +58,14 @@ _WIDER = 16.0
 _FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step. The damping is small, because the start is close to the minimum.
 _DAMPING = 1e-6
-# Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
-# the pose of a minimal sample than at an improved pose.
+# Factors of the inlier threshold in the first and in the second least-squares step. Inliers of a minimal sample's pose
+# have larger residuals than inliers of an improved pose.
 _LIMITS = 3.0, 1.0
-# If `pose_sigma` exceeds _OPEN, an incorrect pose may have as many inliers as the correct pose, for example if a flat
-# scene is seen in a narrow field of view. At least _OPEN_SAMPLES samples are then drawn.
+# If `pose_sigma` exceeds _OPEN, at least _OPEN_SAMPLES samples are drawn, because an incorrect pose may have as many
+# inliers as the correct pose. An example is a flat scene in a narrow field of view.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
-# The first _PLAIN_SAMPLES samples take as long as `agreement_of_neighbours`. Then the chance of each pair is multiplied
-# by (a + agreement)^b. The numbers a = _LEAST_AGREEMENT and b = _AGREEMENT_POWER were chosen empirically.
+# Solving _PLAIN_SAMPLES samples takes as long as `agreement_of_neighbours`. After these samples, the chance of each
+# pair is multiplied by (a + agreement)^b. The numbers a = _LEAST_AGREEMENT and b = _AGREEMENT_POWER are empirical.
 _PLAIN_SAMPLES = 256
 _LEAST_AGREEMENT, _AGREEMENT_POWER = 0.3, 1.5
 
@@ -85,7 +85,7 @@ class Search:
     r"""One search for the best poses of a batch, without gradients.
 
     A pose is stored as the twelve entries of :math:`[R | t]`, see :func:`~kornia_pnpnet.propose.scoring.as_pose`. If
-    the focal length is unknown, the last row of this matrix is multiplied by ``problem.focal`` and divided by the
+    the focal length is unknown, the last row of :math:`[R | t]` is multiplied by ``problem.focal`` and divided by the
     estimated focal length.
 
     Args:
@@ -96,8 +96,8 @@ class Search:
         sigma: standard deviation of the pixels, shape :math:`(B, 1)` or :math:`(B, N)`. If ``None``, the search
             estimates the standard deviation from the residuals of the inliers.
         finds_rivals: whether the search finds ``rivals``.
-        ranks: whether to sort the pairs by :func:`~kornia_pnpnet.propose.sampling.ranked`. Poses then do not depend on
-            the caller's order of the pairs.
+        ranks: whether to sort the pairs by :func:`~kornia_pnpnet.propose.sampling.ranked`. Sorting makes the poses
+            independent of the caller's order of the pairs.
 
     Attributes:
         poses: the best pose of each problem, shape :math:`(B, 12)`.
@@ -129,7 +129,7 @@ class Search:
         self.thresholds, sigma = map_tensors(lambda x: x.to(_DTYPE), (thresholds, sigma))
         self.sigma = None if sigma is None else sigma.expand_as(problem.weights)
         self.scene = Scene.of(problem, self.thresholds, _DTYPE)
-        # All numbers of a pair are adjacent, (B, N, 6) or (B, N, 18) for rigs, so that one operation selects pairs.
+        # All numbers of a pair are adjacent, so that one operation selects pairs: (B, N, 6), or (B, N, 18) for rigs.
         of_rig = [] if problem.rig is None else [problem.rig.rotation.flatten(2), problem.rig.translation]
         self.pairs = torch.cat((problem.world_points, problem.img_points, problem.weights[..., None], *of_rig), -1)
         self.low = self.pairs.to(_DTYPE)
@@ -145,7 +145,7 @@ class Search:
         pose, camera = self._state(self.poses.to(self.problem.weights))
         # One Newton step towards the closest orthogonal matrix doubles the number of correct digits.
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
-        # If a sample is degenerate, for example if rounding makes rays equal, its solution can be far from a rotation.
+        # The solution of a degenerate sample can be far from a rotation, for example if rounding makes rays equal.
         is_rotation = ((rotation * pose.rotation).sum((1, 2), keepdim=True) - 3.0).abs() < _FAR_FROM_ROTATION
         rotation = torch.where(is_rotation, rotation, torch.eye(3, dtype=rotation.dtype, device=rotation.device))
         return State(Pose(rotation, pose.translation), camera)
@@ -155,8 +155,8 @@ class Search:
 
         Args:
             given: poses that compete with the poses of the samples, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
-            enough: a problem with given poses is searched only if the inliers of its best pose require more than this
-                number of samples.
+            enough: number of samples. A problem with given poses is searched only if the inliers of its best pose
+                require more samples.
 
         Returns:
             The batch indices of the problems from which samples were drawn.
@@ -224,7 +224,7 @@ class Search:
         return Problem(values[..., :3], values[..., 3:5], weights, focal, *scales, usual, rig=rig, free_focal=free)
 
     def _projected(self, rows: Tensor, poses: Tensor) -> tuple[Problem, Thresholds, Projection]:
-        """Select the problems and thresholds at ``rows`` (R,), and project the points at poses (R, 12), in float32."""
+        """Select problems and thresholds at ``rows`` (R,), and project the points with poses (R, 12), in float32."""
         problem = self._unpacked(self.low[rows].permute(2, 1, 0).contiguous(), rows)
         return problem, take(self.thresholds, rows), project(self._state(poses), problem)
 
@@ -240,10 +240,10 @@ class Search:
         self.samples = self._samples(chances)
 
     def _expect(self, at: Tensor) -> None:
-        """Estimate the number of samples that the given problems need, from the inliers of their best poses.
+        """From the inliers of the best poses, estimate the number of samples that the given problems need.
 
-        After `_prefer_agreement`, the estimate is the geometric mean of the numbers for the old and the new chances. If
-        structures repeat, outliers also have common neighbours. The new number alone could then end a search too early.
+        After `_prefer_agreement`, the estimate is the geometric mean of the numbers for the old and the new chances.
+        If structures repeat, outliers also have common neighbours, and the number for the new chances may be too small.
         """
         if not len(at):
             return
@@ -368,8 +368,8 @@ def _in_order(tree: _T, order: Tensor) -> _T:
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
     """Take one least-squares step. Pairs are weighted by the products of ``weights`` (B, N) and ``problem.weights``.
 
-    If the focal length has a prior, the weight of the prior depends on ``variance`` (B, 1), the variance of a pixel
-    coordinate. By default, this variance is one squared pixel of the caller's image.
+    If the focal length has a prior, the prior's weight depends on the ``variance`` (B, 1) of a pixel coordinate. The
+    default variance is one squared pixel of the caller's image.
     """
     weights = problem.weights * weights
     equations = normal_equations(projection, problem, weights)
@@ -390,7 +390,7 @@ def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -
 def full_vectors(rows: Tensor, pairs: int = 1) -> Tensor:
     """Repeat the first row until the number of rows is a multiple of `_VECTOR`, unless each row has many pairs.
 
-    Processors round differently in partly filled vectors, so that results would depend on the position in the batch.
+    In partly filled vectors, processors round differently, and results would depend on the position in the batch.
     """
     if compiling() or pairs > _VECTOR:
         return rows

@@ -47,8 +47,8 @@ _ABSENT = -1e9
 # Minimal samples, as ranks of the pairs in descending order of likelihood. The first six samples are a Turán system:
 # if two of the six likeliest pairs are outliers, at least one of the six samples has only inliers.
 _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0, 2, 3), (1, 2, 3))
-# For each entry (n, f), problems of at least n pairs also use the samples above with all ranks multiplied by f. If the
-# likeliest pairs agree on an incorrect pose, the samples of larger ranks help.
+# For each entry (n, f), problems of at least n pairs also use _SAMPLES with all ranks multiplied by f. If the likeliest
+# pairs agree on an incorrect pose, the samples of larger ranks help.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
 # 25 further samples of the 25 likeliest pairs, for problems of at least 36 pairs. No two samples share two pairs.
 _RING_FROM = 36
@@ -73,8 +73,8 @@ class _View:
     r"""The network's input.
 
     The features are invariant to units, to rotations of the world, and to rotations of the camera except the roll. The
-    camera is rotated to the mean ray, and zoomed so that the spread of the rays is 1. Ridge regression fits an affine
-    camera to the pairs, and the world is rotated to the axes of this affine camera.
+    camera is rotated to the mean ray, and the rays are scaled to the spread 1. Ridge regression fits an affine camera
+    to the pairs, and the world is rotated to the axes of this affine camera.
 
     Attributes:
         there: 1 for usual pairs (see ``Problem.usual``) with a weight above 0, else 0, shape :math:`(B, N)`.
@@ -127,7 +127,7 @@ class _View:
             return torch.zeros_like(problem.weights)[..., None].expand(-1, -1, 4)
         sigmas = torch.stack((problem.noise.img, problem.noise.world), -1)  # (B, N, 2)
         known = sigmas.isfinite()
-        # Unknown sigmas are NaN. They are replaced before the division, because `unit` would get the gradient NaN.
+        # Unknown sigmas are NaN, and are replaced before the division. Otherwise `unit` would get the gradient NaN.
         relative = torch.where(known, sigmas, 1.0) / torch.where(known, self.unit[:, None], 1.0)
         logs = torch.where(known, relative.clamp(min=_LEAST_NOISE).log() - _LOG_NOISE, 0.0)
         return torch.cat((logs, known.to(logs.dtype)), -1)
@@ -161,7 +161,7 @@ def _frame(affine: Tensor, squares: Tensor) -> Tensor:
 
 
 def _taken(tree: _T, index: Tensor) -> _T:
-    """Select pairs by positions (B, K) in each tensor (B, N, ...) of pairs. Tensors without pairs do not change."""
+    """Select pairs by positions (B, K) in each tensor (B, N, ...) of pairs. Other tensors do not change."""
 
     def take(x: Tensor) -> Tensor:
         of_pairs = x.ndim > 1 and x.shape[1] > index.shape[1]
@@ -186,7 +186,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 
 
 def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
-    """For S samples: the least number of pairs of a problem that uses each sample, and the 3 S ranks of all samples."""
+    """How many pairs a problem must have for each of S samples, and the 3 S ranks of the pairs of these samples."""
     every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
     if not search_follows:  # a search draws further samples
         every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
@@ -239,7 +239,7 @@ class _Block(nn.Module):
         values, scores = self.look.weight.split((width, heads))
         # The scores have no bias, because the softmax over pairs cancels a bias.
         attention = _attention(y, scores, absent).movedim(0, 1)  # (B, heads, N)
-        # The values are linear in y, so that the mean of the values follows from the mean of y.
+        # The values are linear in y. The mean of the values therefore follows from the mean of y.
         means = torch.bmm(attention, y.view(batch, count, width)).movedim(1, 0)  # (heads, B, width)
         bias = self.look.bias[:width].view(heads, 1, -1)
         context = torch.baddbmm(bias, means, values.view(heads, -1, width).mT).movedim(0, 1).reshape(batch, width)
@@ -341,9 +341,9 @@ class SetInit(Initialiser):
 
         Args:
             problem: pairs in any order. The world is centred and scaled.
-            search_follows: whether :func:`~kornia_pnpnet.propose.ransac.search_on` follows. The network then sees at
-                most 48 pairs, and solves fewer samples. The weight of a pair that the network does not see is the
-                agreement of the pair with the last hypothesis.
+            search_follows: whether :func:`~kornia_pnpnet.propose.ransac.search_on` follows. If so, the network sees at
+                most 48 pairs, and fewer samples are solved. Pairs that the network does not see are weighted by their
+                agreement with the last hypothesis.
 
         Returns:
             The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
@@ -386,7 +386,7 @@ class SetInit(Initialiser):
 
     @torch.no_grad()
     def _sampled(self, problem: Problem, chances: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
-        """The pose with the best score of all poses of the samples, or ``fallback`` if no sample has a valid pose."""
+        """Find the best-scoring pose of all samples, or return ``fallback`` if no sample has a valid pose."""
         batch, count = chances.shape
         there = problem.usual_weights > 0
         # Unlikely pairs also contribute to scores, because they can be inliers.

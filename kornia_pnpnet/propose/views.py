@@ -65,7 +65,7 @@ def _views(problem: Problem, count: int, order: bool) -> Problem:
 
 
 def _undone(pose: Pose, count: int) -> list[Pose]:
-    """Transform the poses of the views, except the first view, into poses of the problems."""
+    """Transform the poses of all views except the first into poses of the problems."""
     poses = []
     matrices, vectors = (x.movedim(0, -1).unflatten(-1, (count, -1)).unbind(-2)[1:] for x in pose)
     for view, matrix, vector in zip(VIEWS[1:count], matrices, vectors, strict=True):  # (3, 3, B), (3, B)
@@ -82,7 +82,7 @@ def _exchanged(x: Tensor, y: Tensor, swap: bool, reverse_x: bool, reverse_y: boo
 
 
 def _axes_back(entries: Tensor, axis: int, view: tuple[bool, bool, bool]) -> Tensor:
-    """Undo the signs and the exchange of a view in the coordinates x, y and z along ``axis``."""
+    """Convert the coordinates x, y and z of a view (along ``axis``) to coordinates in the problem."""
     x, y, z = entries.unbind(axis)
     x, y = _exchanged(x, y, False, *view[1:])
     return torch.stack((y, x, z) if view[0] else (x, y, z), axis)

@@ -68,7 +68,7 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
 
 
 def _describe(results: RunResults) -> str:
-    """Describe a run in one line that contains its command. ``PATH`` replaces absolute paths, except in ``weights``."""
+    """Describe a run in one line with its command. Absolute paths become ``PATH``, except ``weights`` of known runs."""
     words = ["python train.py"]
     for override in results.overrides:
         key, _, value = override.partition("=")

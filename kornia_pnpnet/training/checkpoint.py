@@ -66,7 +66,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, An
 
 
 class History:
-    """Learning curves in a CSV file and in TensorBoard. Rows of earlier calls with ``update > start`` are removed."""
+    """Learning curves in a CSV file and in TensorBoard. Earlier rows with ``update > start`` are removed."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
         self._path, self._columns = folder / HISTORY_NAME, columns
@@ -90,7 +90,7 @@ class History:
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Raise ``TrainingError`` if the file is damaged or has another identity. But the file may have fewer ``updates``.
+    Raise ``TrainingError`` if the file is damaged or has another identity. Fewer ``updates`` in the file are allowed.
     """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)

@@ -149,9 +149,9 @@ def fit(
         folder: folder of the run.
         fabric: a launched Lightning Fabric. ``None`` means one process on the CPU.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
-            only with the same ``identity`` and the same settings, except that ``settings.updates`` may grow. In this
-            case, the learning rates and the ramp follow the schedule of the longer run.
-        data_workers: number of worker processes that draw the next batches for each training process.
+            only with the same ``identity`` and the same settings, except that ``settings.updates`` may grow. With
+            more updates, the learning rates and the ramp follow the schedule of the longer run.
+        data_workers: number of worker processes per training process. The workers draw the next batches.
         resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
 
@@ -207,7 +207,7 @@ def fit(
     update, interrupted, logged = start, False, (start, dict(clock.seconds))
 
     def report(since: int, before: Mapping[str, float]) -> FitReport:
-        """Report the work after the update ``since``. Until then, the stages had taken ``before`` seconds."""
+        """Report the work after the update ``since``. ``before`` has the seconds of each stage up to this update."""
         clock.lap("rest")
         spent = {stage: seconds - before[stage] for stage, seconds in clock.seconds.items()}
         whole = sum(spent.values())
@@ -236,8 +236,8 @@ def fit(
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
             terms = _compare(solver, loss, problems, ramp)
-            # Before the ramp, the loss gets a zero term with the parameters of the refinement, because training on
-            # several processes needs a gradient of every parameter.
+            # Training on several processes needs a gradient of every parameter. Before the ramp, the loss therefore
+            # gets a zero term with the parameters of the refinement.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
             clock.lap("forward")
             optimizer.zero_grad()

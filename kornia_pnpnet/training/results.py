@@ -219,7 +219,7 @@ def find_results(weights: str | Path) -> RunResults | None:
     For the argument and the errors see :func:`~kornia_pnpnet.pretrained.find_weights` and :func:`load_run`.
     """
     folder = find_weights(weights)
-    # `train.py` writes weights into the folder `weights` of a run. Results beside any other folder can be unrelated.
+    # `train.py` writes weights into the folder `weights` of a run. Parents of other folders can hold unrelated results.
     folders = [folder, folder.parent] if folder.name == "weights" else [folder]
     paths = (place / RESULTS_NAME for place in folders)
     return next((load_run(path) for path in paths if path.is_file()), None)

@@ -12,7 +12,7 @@ from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.training.card import HOW_IT_RAN
 
-# The first column of a summary after the columns of the overrides.
+# The column of a summary that follows the overrides.
 _FIRST_RESULT = "update"
 
 
@@ -39,7 +39,7 @@ class SweepTable(Callback):
 
 
 def _as_sorted(text: str) -> tuple[float, str]:
-    """Make a sort key that sorts numbers by value, before all other texts."""
+    """Make a sort key. Numbers are sorted by value and precede all other texts."""
     try:
         return float(text), ""
     except ValueError:
