@@ -60,7 +60,7 @@ _NOWHERE = 1e6  # height of a street's box, so large that no ray reaches the top
 # Largest field of view in degrees. A pinhole camera needs a field of view below 180 degrees.
 _WIDEST = 170.0
 # Depth maps: standard deviation of a map camera's coordinates in the query camera's frame, divided by the points' mean
-# distance. The directions from a point to the map camera and to the query camera differ by 10 to 40°.
+# distance. The directions from a point to the map camera and to the query camera typically differ by 10 to 40°.
 _BASELINE = 0.3
 # Depth maps: smallest and largest relative error of a flying pixel's distance from its map camera.
 _FLIGHT = (-0.3, 0.6)

@@ -23,7 +23,7 @@ __all__ = ["BOUNDS", "default_solvers", "load_solver", "missing_package"]
 #: Bounds by name. A bound needs the true poses and inliers, so a bound cannot solve new problems.
 BOUNDS: dict[str, type[nn.Module]] = {"known-inliers": KnownInliers, "known-inliers-and-noise": KnownInliersAndNoise}
 
-# Competitors of the protocol, in the order of the protocol's figures.
+# Solvers that are evaluated by default, in the order of the results.
 _COMPETITORS = (
     *("pnpnet-set", "pnpnet-n{n}", "net-n{n}", "identity-lm", "epnp", "epnp-lm", "reppnp", "reppnp-lm"),
     *("ransac-epnp-lm", "p3p-ransac", "opencv-sqpnp", "opencv-epnp", "opencv-ransac", "opencv-usac"),
@@ -70,7 +70,7 @@ def load_solver(spec: str) -> nn.Module:
 
 
 def default_solvers(n: int | Iterable[int], sources: Iterable[str] = ("synthetic",)) -> list[str]:
-    """List the names of the protocol's installed competitors and bounds. :func:`load_solver` accepts the names.
+    """List the names of installed solvers and bounds to evaluate by default. :func:`load_solver` accepts the names.
 
     Args:
         n: number of pairs per problem, or several such numbers.

@@ -89,7 +89,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """Of a cubic form with coefficients (4, C), find the real root ``u : v`` that is farthest from the other two roots.
 
-    Two nearly equal solutions of P3P give two nearly equal roots. The third root gives a line through both solutions.
+    Two nearly equal solutions of P3P give two nearly equal roots. The third root's conic has a line through both.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()

@@ -429,7 +429,7 @@ class SetInit(Initialiser):
         return as_pose(torch.where((score > -torch.inf)[:, None], chosen, as_entries(fallback)))
 
     def _run(self, view: _View) -> tuple[Tensor, Tensor]:
-        """The outputs of the network for pairs (1 + 2 S, B, N), and for problems (B, S + 2)."""
+        """The network's outputs per pair (1 + 2 S, B, N) and per problem (B, S + 2), for S ``starts``."""
         x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
         absent = torch.where(view.there > 0, x.new_zeros(()), _ABSENT).contiguous()
         for block in self.blocks:

@@ -408,7 +408,7 @@ class RobustWeightedLM(Configured):
         return equations
 
     def _best(self, rivals: Problem, prior: Tensor, shape: Tensor, now: Progress) -> Progress:
-        """For each problem, keep the state of lowest cost. ``rivals`` holds the problem of each state in ``now``."""
+        """For each problem, keep the state of lowest cost. ``rivals`` are the problems, one for each state ``now``."""
         batch = prior.shape[0]
         projection = project(map_tensors(torch.Tensor.detach, now.state), rivals)
         cost = self._cost(projection, rivals, rivals.weights, shape.detach())
