@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from kornia.core.exceptions import ValueCheckError
@@ -35,7 +36,7 @@ def pose_covariance(
     pose: Pose,
     world_points: Tensor,
     img_points: Tensor,
-    intrinsics: Tensor | PinholeCamera,
+    intrinsics: Tensor | PinholeCamera | None,
     *,
     img_sigma: Tensor | float | None = None,
     world_sigma: Tensor | float | None = None,
@@ -45,6 +46,9 @@ def pose_covariance(
     prior: PosePrior | None = None,
     focal: str = "known",
     focal_sigma: float | None = None,
+    dist: Tensor | None = None,
+    fisheye: Tensor | None = None,
+    cam_from_rig: Pose | None = None,
 ) -> Tensor:
     r"""Compute the first-order covariance of a pose that was found by weighted least squares.
 
@@ -61,7 +65,7 @@ def pose_covariance(
     Args:
         pose: the estimated world-to-camera pose, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`, also for dimensions and dtypes.
-        img_points: pixels; see ``PnPNet.forward``.
+        img_points: pixels or bearings; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         img_sigma: see ``PnPNet.forward``; required if ``img_cov`` is ``None``.
         world_sigma: see ``PnPNet.forward``. If ``world_sigma`` and ``world_cov`` are ``None``, world points are exact.
@@ -73,6 +77,9 @@ def pose_covariance(
         focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
             ``intrinsics`` of the result, not the ``intrinsics`` of the solver's call.
         focal_sigma: the solver's ``focal_sigma``, a prior whose information is added to the information of the pairs.
+        dist: see ``PnPNet.forward``. The coefficients are exact, also when the solver estimated them.
+        fisheye: see ``PnPNet.forward``.
+        cam_from_rig: see ``PnPNet.forward``. The covariance is that of the pose of the rig.
 
     Returns:
         The covariance in radians and the unit of the world, shape :math:`(B, 6, 6)`, with the dtype of a solver's
@@ -103,11 +110,14 @@ def pose_covariance(
         img_cov=img_cov,
         world_cov=world_cov,
         prior=prior,
+        dist=dist,
+        fisheye=fisheye,
+        cam_from_rig=cam_from_rig,
         init_name="pose",
     )
-    dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
+    dtype, inputs = inputs.world_points.dtype, map_tensors(_double, inputs)
     # The information matrix is well conditioned if the points have the centroid 0 and the spread 1.
-    problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise)
+    problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise, None, inputs.rig)
     assert inputs.init is not None
     assert problem.noise is not None
     framed_pose, posed = frame.start(inputs.init)
@@ -159,18 +169,24 @@ def pose_covariance(
 
 @torch.no_grad()
 def shown_noise(
-    pose: Pose, world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, weights: Tensor | None
+    pose: Pose,
+    world_points: Tensor,
+    img_points: Tensor,
+    intrinsics: Tensor | PinholeCamera | None,
+    weights: Tensor | None,
+    **camera: Any,
 ) -> dict[str, Tensor]:
     """Estimate the noise of pixels and points from the residuals at a pose.
 
     At a larger depth, the noise of a point moves the point's pixel less. The noise of a pixel does not depend on the
     depth. Five mixtures of pixel noise and point noise are tried. The largest Gaussian likelihood selects one of them.
 
-    See :func:`pose_covariance` for the arguments. The returned dict has ``img_sigma`` and ``world_sigma``, shape (B,).
+    See :func:`pose_covariance` for the arguments. ``camera`` has ``dist``, ``fisheye`` and ``cam_from_rig``. The
+    returned dict has ``img_sigma`` and ``world_sigma``, shape (B,).
     """
-    size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose")
-    dtype, inputs = inputs.world_points.dtype, map_tensors(torch.Tensor.double, inputs)
-    problem, frame = Normalize(order=False)(*inputs[:5])
+    size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose", **camera)
+    dtype, inputs = inputs.world_points.dtype, map_tensors(_double, inputs)
+    problem, frame = Normalize(order=False)(*inputs[:5], None, None, inputs.rig)
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
@@ -185,3 +201,7 @@ def shown_noise(
     share, scale = share[best, 0], scale.gather(0, best[None])[0]
     img, world = (share * scale).sqrt() / problem.img_scale, ((1.0 - share) * scale / mean).sqrt() * frame.size
     return {"img_sigma": restore_leading(size, img.to(dtype)), "world_sigma": restore_leading(size, world.to(dtype))}
+
+
+def _double(x: Tensor) -> Tensor:
+    return x.double() if x.is_floating_point() else x

@@ -14,7 +14,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from kornia_pnpnet.arguments import checked_inputs
-from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.checks import check_form, check_positive, check_whole
 from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
@@ -80,7 +80,7 @@ def monte_carlo_pose_loss(
         truth: true world-to-camera poses, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`.
         hypotheses: further poses around which samples are drawn, such as the ``pose`` of a result.
         world_points: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`, also for dimensions and dtypes.
-        img_points: see ``PnPNet.forward``.
+        img_points: pixels; see ``PnPNet.forward``.
         intrinsics: see ``PnPNet.forward``.
         weights: see ``PnPNet.forward``.
         mask: see ``PnPNet.forward``.
@@ -135,6 +135,7 @@ def monte_carlo_pose_loss(
         ]
 
     checked = check(world_points)
+    check_form(["*", "N", "2"], img_points=img_points)  # no bearings
     if len({x.world_points.dtype for _, x in checked}) > 1:  # only some poses are in float64
         checked = check(world_points.double())
     size, inputs = checked[0]

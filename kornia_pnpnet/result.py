@@ -371,34 +371,36 @@ class PnPResult(NamedTuple):
         return self.pose.matrix
 
     def covariance(
-        self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera, **noise: Any
+        self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor | PinholeCamera | None, **more: Any
     ) -> Tensor:
         """The covariance of the pose, computed by :func:`~kornia_pnpnet.covariance.pose_covariance`.
 
         Args:
             world_points: the points of the solver's call.
-            img_points: the pixels of the solver's call.
+            img_points: the pixels or bearings of the solver's call.
             intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the result's ``intrinsics``
-                are used instead.
-            noise: further arguments of ``pose_covariance``. The default weights are ``inliers``. If no noise is given,
-                the noise is estimated from the residuals of the inliers (see
-                :func:`~kornia_pnpnet.covariance.shown_noise`). If only noise of the points is given, ``sigma`` is the
-                noise of the pixels.
+                and ``dist`` are used instead.
+            more: further arguments of ``pose_covariance``. The lens and the rig must be those of the solver's call. The
+                default weights are ``inliers``. If no noise is given, the noise is estimated from the residuals of the
+                inliers (see :func:`~kornia_pnpnet.covariance.shown_noise`). If only noise of the points is given,
+                ``sigma`` is the noise of the pixels.
 
         Returns:
             Shape :math:`(B, 6, 6)`, see ``pose_covariance``.
         """
         from kornia_pnpnet.covariance import pose_covariance, shown_noise
 
-        if noise.get("focal") == "unknown" and self.intrinsics is not None:
+        if more.get("focal") == "unknown" and self.intrinsics is not None:
             intrinsics = self.intrinsics
-        if "weights" not in noise and self.inliers is not None:
-            noise["weights"] = self.inliers.to(self.rotation.dtype)
-        if not {"img_sigma", "img_cov", "world_sigma", "world_cov"}.isdisjoint(noise):
-            noise.setdefault("img_sigma", None if "img_cov" in noise else self.sigma)
+            more.setdefault("dist", self.dist)
+        if "weights" not in more and self.inliers is not None:
+            more["weights"] = self.inliers.to(self.rotation.dtype)
+        if not {"img_sigma", "img_cov", "world_sigma", "world_cov"}.isdisjoint(more):
+            more.setdefault("img_sigma", None if "img_cov" in more else self.sigma)
         else:
-            noise |= shown_noise(self.pose, world_points, img_points, intrinsics, noise.get("weights"))
-        return pose_covariance(self.pose, world_points, img_points, intrinsics, **noise)
+            camera = {name: more[name] for name in ("dist", "fisheye", "cam_from_rig") if name in more}
+            more |= shown_noise(self.pose, world_points, img_points, intrinsics, more.get("weights"), **camera)
+        return pose_covariance(self.pose, world_points, img_points, intrinsics, **more)
 
 
 class Problems(NamedTuple):

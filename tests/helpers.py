@@ -33,7 +33,6 @@ CHI_SQUARE = {1: 10.83, 2: 13.82, 3: 16.27, 6: 22.46, 8: 26.12, 19: 43.82}
 WIDTH, HEIGHT, FOCAL, CENTRE = 640, 480, 500.0, np.array([320.0, 240.0])
 ERRORS = BaseError, ValueError
 NAN, INF = float("nan"), float("inf")
-TIMES = int(os.environ.get("PNPNET_EXAMPLES", "1"))
 
 
 def assert_same(one: Any, two: Any, rtol: float = 0.0, atol: float = 0.0, **more: Any) -> None:
@@ -179,7 +178,7 @@ def match_arrays(*counts):
 def many(examples):
     """Settings of a fuzz test; ``PNPNET_EXAMPLES`` multiplies its examples."""
     slow = [HealthCheck.too_slow]
-    count = max(1, examples // 2 * TIMES)
+    count = max(1, examples // 2 * int(os.environ.get("PNPNET_EXAMPLES", "1")))
     return settings(max_examples=count, deadline=None, derandomize=True, suppress_health_check=slow)
 
 

@@ -158,7 +158,7 @@ class RobustWeightedLM(Configured):
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
         step: initial :math:`\gamma`, in [0, 2].
         damping: initial :math:`\lambda`, in [1e-8, 100].
-        robustness: initial shape of the kernel; ``None``: the classical value of the kernel. The kernel ``power`` with
+        robustness: initial shape of the kernel; ``None``: the default of the kernel. The kernel ``power`` with
             the shape 0 is least squares.
         shared: learn one set of hyperparameters for all iterations instead of one set per iteration.
         update: ``"retraction"`` on the rotation group, or the paper's ``"additive"`` update of the rotation vector.

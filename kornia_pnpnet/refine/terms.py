@@ -1,7 +1,7 @@
 """Priors of the pose and of the camera. Each prior is a :class:`~kornia_pnpnet.problem.Term`.
 
 To add a prior, write a class with the methods of ``Term``. ``PnPNet._propose`` puts the instances into
-``Problem.pose_terms``.
+``Problem.pose_terms``. The page "Method" of the documentation lists the other places.
 """
 
 from __future__ import annotations
