@@ -486,7 +486,8 @@ SHORT = {
     "list": ((), "--x"),
     "demo": (("--problems", 3, "--train-seconds", 0), "--data --problems"),
 }
-TEXTS = WORDS | st.sampled_from("9 6,9 none,2 50% uniform float64 gaussian_pose p3p-ransac 1e9".split())
+SETS = ["9", "6,9", "none,2", "50%", "uniform", "float64", "gaussian_pose", "p3p-ransac", "1e9"]
+TEXTS = WORDS | st.sampled_from(SETS)
 
 
 def test_any_arguments_are_a_line_and_no_traceback(tmp_path, monkeypatch):
