@@ -166,7 +166,7 @@ def restore_leading(size: torch.Size, result: _T) -> _T:
 
 
 def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, like: Tensor) -> Tensor:
-    """Return the cameras of a rig, for each problem or for each pair. Matrices are scaled to a last entry of 1."""
+    """Return the caller's camera matrices of a rig, for each problem or each pair, scaled to a last entry of 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
     matrices = _cameras(intrinsics, size).to(like.dtype)
@@ -186,7 +186,7 @@ def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | N
 
     A part has about ``most`` pairs for each CPU thread. The size of a part has no limit if ``most`` is ``None`` or
     gradients are recorded. If ``any_number`` is true (``solve`` accepts any number of pairs), problems with a mask are
-    grouped by number of pairs. If the numbers of pairs differ strongly, grouping saves a third to half of the time.
+    grouped by number of pairs, to limit padding. This saves a third to half of the time if the numbers differ strongly.
     """
     batch, count = inputs.world_points.shape[:2]
     if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:

@@ -77,7 +77,7 @@ def pose_covariance(
         focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
             ``intrinsics`` of the result, not the ``intrinsics`` of the solver's call.
         focal_sigma: the solver's ``focal_sigma``, a prior whose information is added to the information of the pairs.
-        dist: see ``PnPNet.forward``. The coefficients are exact, also when the solver estimated them.
+        dist: see ``PnPNet.forward``. The coefficients are taken as exact, also when the solver estimated them.
         fisheye: see ``PnPNet.forward``.
         cam_from_rig: see ``PnPNet.forward``. The covariance is that of the pose of the rig.
 
@@ -85,12 +85,13 @@ def pose_covariance(
         The covariance in radians and the unit of the world, shape :math:`(B, 6, 6)`, with the dtype of a solver's
         result. With an unknown focal length the shape is :math:`(B, 7, 7)`, and the last row and column belong to the
         logarithm of the focal length. If the pairs do not determine the pose, or a solver would refuse the problem, the
-        diagonal is infinite and all other entries are 0. With ``focal="unknown"``, the diagonal is also infinite if
-        the given focal length differs by more than a factor of 1.5 from the one that fits the pixels at the pose.
+        diagonal is infinite and all other entries are 0. The same holds with ``focal="unknown"`` if the given focal
+        length differs by more than a factor of 1.5 from the focal length that fits the pixels at the pose.
 
     Raises:
         BaseError: see ``PnPNet.forward``; also if the noise of the pixels is missing, if ``focal`` is neither
-            ``"known"`` nor ``"unknown"``, or if ``focal_sigma`` is given for a known focal length.
+            ``"known"`` nor ``"unknown"``, if ``focal_sigma`` is given for a known focal length, or if the focal length
+            of a rig or of bearings is unknown.
 
     Example:
         >>> from kornia_pnpnet.data import SyntheticProblems
@@ -115,6 +116,8 @@ def pose_covariance(
         cam_from_rig=cam_from_rig,
         init_name="pose",
     )
+    if focal == "unknown" and inputs.rig is not None:
+        raise ValueCheckError("focal='unknown' takes pixels of one camera.")
     dtype, inputs = inputs.world_points.dtype, map_tensors(_double, inputs)
     # The information matrix is well conditioned if the points have the centroid 0 and the spread 1.
     problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise, None, inputs.rig)

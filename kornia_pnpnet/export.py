@@ -59,7 +59,7 @@ class ExportedResult(NamedTuple):
 
 
 class ExportedCamera(NamedTuple):
-    """The fields of :class:`ExportedResult`, and ``camera`` (the result's ``intrinsics``, shape :math:`(B, 3, 3)`)."""
+    """The fields of :class:`ExportedResult`, then ``camera`` (the result's ``intrinsics``, shape :math:`(B, 3, 3)`)."""
 
     rotation: Tensor
     translation: Tensor
@@ -79,7 +79,7 @@ OUTPUTS = ExportedResult._fields
 _MAX_BATCH, _MAX_N = 2**20, 2**16
 # Keys of a package's metadata. `_ANY` is the value for a size that is not fixed.
 _BATCH, _N, _ANY, _RIG = "pnpnet_batch", "pnpnet_n", "any", "pnpnet_rig"
-# If `n` is not a sequence, `_MODEL` is the name of the only model. `_MODELS` is a package's folder of models.
+# Name of the only model (if `n` of `export_package` is no sequence), and folder of all models in a package's archive.
 _MODEL, _MODELS = "model", "/data/aotinductor/"
 
 
@@ -199,12 +199,12 @@ def export_package(
     all of this machine's instruction sets (for example AVX-512). Compiling takes minutes. An existing file is replaced
     only when the package is complete.
 
-    With ``batch=1`` and a fixed number of pairs, one problem takes a fraction of the time of a general package. If
-    PyTorch's own loader runs this faster package, each call overwrites the previous result of the same thread.
+    A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
+    packages. With PyTorch's own loader, a call of such a package overwrites the previous result of the same thread.
 
-    If ``n`` is a sequence of numbers, such as ``(16, 64, 256)``, the package holds a model for each number. Each
-    problem is padded to the next of these numbers. C++ programs choose a model by name: the model for 16 pairs is
-    "n16". If ``n`` is a single number or ``None``, the only model is "model".
+    If ``n`` is a sequence of numbers, such as ``(16, 64, 256)``, the package holds a model for each number. If there
+    are several, a problem is padded to the next of these numbers. C++ programs choose a model by name: the model for
+    16 pairs is "n16". If ``n`` is a single number or ``None``, the only model is "model".
 
     Returns:
         The path, which must end in ``.pt2``.
@@ -325,7 +325,7 @@ def load_package(path: str | Path) -> PackagedSolver:
 def export_onnx(
     solver: PnPNet, path: str | Path, n: int | None = None, *, batch: int | None = None, rig: bool = False
 ) -> Path:
-    """Write a solver to one file as an ONNX model, and return the path. ONNX Runtime needs no PyTorch.
+    """Write a solver to one file as an ONNX model, and return the path. ONNX Runtime runs the model without PyTorch.
 
     See :func:`export_program` for the arguments, inputs, outputs and errors. Without the extra ``onnx``, the function
     raises ``ImportError``. An existing file is replaced only when the model is complete.

@@ -28,7 +28,7 @@ _LARGEST_ENTRY = torch.finfo(torch.float32).max ** 0.25
 _FAR, _MANY, _FAR_OF_FEW = 5.0, 12, 25.0
 # Points beyond this number of typical distances from the median lose their weight, because float32 has too few digits.
 _LARGEST_DISTANCE = 1e6
-# A confidence may be outside [0, 1] by less than this number, because cosines of descriptors have rounding errors.
+# A confidence (such as a cosine of descriptors) may leave [0, 1] by less than this number, because of rounding.
 _ROUNDING = 1e-3
 # Tangent of 85 degrees. A real lens without distortion does not see rays that are more than 85 degrees off the axis.
 _FAR_ANGLE = 11.4
@@ -105,7 +105,7 @@ class Normalize(Configured):
     Pixels become pixels of a camera with the focal length ``f_const`` and the principal point 0.
 
     A *valid* problem has finite numbers, weights of at least 0, and a pinhole camera (any multiple of a camera matrix,
-    with or without skew). At least three pairs have a positive weight. The points deviate from any line by more
+    with or without skew). At least three of its pairs have a positive weight. Its points deviate from any line by more
     than the rounding errors of the coordinates. Zeros replace the inputs of invalid problems, so that all later values
     and gradients are finite. A pair with the weight 0 is padding. The coordinates of padding are ignored.
 

@@ -35,7 +35,7 @@ _MOST_VARIANCES = 20.0
 class LossTerms(NamedTuple):
     """The loss and its terms. Each field is a scalar, the mean over the batch."""
 
-    total: Tensor  #: Weighted sum of the terms. In the sum, the refined term is saturated, see :class:`PoseLoss`.
+    total: Tensor  #: Weighted sum of the terms. In the sum, the refined terms are saturated, see :class:`PoseLoss`.
     init_rotation: Tensor  #: Chordal rotation distance of the first guess.
     init_translation: Tensor  #: Translation distance of the first guess, measured at the centroid of the points.
     refined_rotation: Tensor  #: Chordal rotation distance after refinement.

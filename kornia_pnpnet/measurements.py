@@ -126,7 +126,7 @@ def depth_points(
     Returns:
         A solver's ``world_points``, shape :math:`(B, N, 3)`, and ``world_cov`` in squared units of the world, shape
         :math:`(B, N, 3, 3)`. A pair gets NaN, without gradient, if its depth is not positive, its sigma is negative, or
-        its camera or pose is invalid. A pair also gets NaN if the fourth power of any of its numbers is not finite.
+        its camera or pose is invalid. The same holds if the fourth power of any of its numbers is not finite.
         The solver's ``mask`` must exclude pairs with NaN; otherwise their problem is not ``ok``.
 
     Raises:

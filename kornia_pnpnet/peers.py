@@ -241,7 +241,7 @@ class OpenCVRansac(_OpenCV, RobustPeer):
     Args:
         threshold: largest reprojection error, in pixels, of an inlier.
         iterations: largest number of RANSAC iterations.
-        confidence: number in (0, 1). RANSAC stops once the probability of a sample without outliers is this high.
+        confidence: RANSAC stops when a sample without outliers was drawn with at least this probability, in (0, 1).
         method: OpenCV's name of the solver for minimal samples, for example ``"AP3P"`` for ``SOLVEPNP_AP3P``.
         refine: whether to minimise the inliers' squared reprojection errors, starting from RANSAC's pose. The field
             ``init`` of the result is the pose before this refinement.

@@ -140,7 +140,7 @@ class PretrainedMixin(nn.Module):
         return ", ".join(f"{name}={value!r}" for name, value in self.options.items())
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
-        """Copy the solver, and replace the refinement or options. The copy and the solver share unchanged modules."""
+        """Copy the solver with another refinement or other options. The copy and the solver share unchanged modules."""
         return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
 
     def config(self) -> dict[str, Any]:
@@ -179,7 +179,7 @@ class PretrainedMixin(nn.Module):
     def from_pretrained(cls, name_or_folder: str | Path) -> Self:
         """Load a trained solver in evaluation mode. Its parameters require gradients.
 
-        To train the solver further, call ``solver.train()``. For inference alone, use ``torch.no_grad()`` or
+        To train the solver further, call ``solver.train()`` first. For inference alone, use ``torch.no_grad()`` or
         ``solver.requires_grad_(False)``, or load a shipped solver with :func:`~kornia_pnpnet.create_solver`.
 
         Args:

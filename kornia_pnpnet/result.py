@@ -316,7 +316,7 @@ class PnPResult(NamedTuple):
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
         sigma: standard deviation of a pixel coordinate in the caller's pixels, estimated from the inliers, shape
             :math:`(B,)`, without gradient. The noise of world points is included. If the standard deviation differs
-            between pairs, ``sigma`` is the geometric mean over all pairs that are not padding.
+            between pairs, ``sigma`` is the geometric mean over all pairs of positive weight.
         inliers: which pairs are inliers of the pose, bool, shape :math:`(B, N)`.
     """
 

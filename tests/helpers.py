@@ -29,7 +29,6 @@ from kornia_pnpnet.refine.residual import moved
 
 # 99.9 % points of the chi-square distribution by degrees of freedom. The seeds are fixed, so that results do not vary.
 CHI_SQUARE = {1: 10.83, 2: 13.82, 3: 16.27, 6: 22.46, 8: 26.12, 19: 43.82}
-
 WIDTH, HEIGHT, FOCAL, CENTRE = 640, 480, 500.0, np.array([320.0, 240.0])
 ERRORS = BaseError, ValueError
 NAN, INF = float("nan"), float("inf")

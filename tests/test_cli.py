@@ -409,6 +409,8 @@ def test_solve_takes_cameras_of_colmap_and_with_skew_scale_and_y_up(csv_file, tm
     radial = answer(csv_file, "--camera", "RADIAL,640,480,800,320,240,-0.05,0.01")
     assert radial["intrinsics"][0][0] == 800
     assert radial["translation"] != plain["translation"]
+    np.savez(tmp_path / "single.npz", world_points=points().astype("f4"), img_points=seen(points()).astype("f4"))
+    assert answer(tmp_path / "single.npz", "--camera", PINHOLE)["ok"]
     camera = 2.0 * np.array([[800.0, 150.0, 320.0], [0.0, -810.0, 240.0], [0.0, 0.0, 1.0]])
     img = points(12) @ camera.T
     np.savez(tmp_path / "skew.npz", world_points=points(12), img_points=img[:, :2] / img[:, 2:], intrinsics=camera)

@@ -1,12 +1,13 @@
 """Covariances of poses against the errors of many problems, of pixels and points as arguments, heat maps and depth."""
 
 import math
+from functools import partial
 from itertools import product
 
 import pytest
 import torch
 from helpers import assert_same, derivative, reprojection_errors
-from kornia.core.exceptions import ShapeError
+from kornia.core.exceptions import BaseError
 from kornia.geometry import conversions
 from kornia.geometry.linalg import transform_points
 from kornia.geometry.subpix import spatial_soft_argmax2d
@@ -84,8 +85,9 @@ def test_lenses_bearings_and_rigs_have_the_covariance_of_a_pinhole_camera():
     expected, *found = (solver(**x).covariance(**x).diagonal(dim1=1, dim2=2) for x in (plain, *calls))
     for covariance in found:  # at the edge of the image, noise of a bearing is another noise of the pixel
         assert_same(covariance, expected, rtol=0.2)
-    with pytest.raises(ShapeError):  # no bearings
-        monte_carlo_pose_loss(pose, pose, **calls[2], img_sigma=1.0)
+    for refuses in (partial(monte_carlo_pose_loss, pose), partial(pose_covariance, focal="unknown")):  # bearings
+        with pytest.raises(BaseError):
+            refuses(pose, **calls[2], img_sigma=1.0)
 
 
 @pytest.mark.parametrize(("n", "outliers"), [(12, 0), (20, 5)])

@@ -1,6 +1,6 @@
 """The command ``pnpnet``. Each subcommand is a module: the module's docstring is the help of the subcommand.
 
-A module's ``run`` returns the exit code. Only ``run`` imports PyTorch, so bad arguments are reported without delay.
+A module's ``run`` returns the exit code. PyTorch is imported after parsing, so bad arguments are reported at once.
 """
 
 from __future__ import annotations

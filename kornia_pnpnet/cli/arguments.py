@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-# Largest standard deviation of log(focal length). `--focal` refuses a larger number: it is probably in pixels.
+# Largest standard deviation of log(focal length) for `--focal`. A larger number is probably a focal length in pixels.
 _MOST_SIGMA = 3.0
 
 #: Names of synthetic data for ``--data``.

@@ -28,7 +28,7 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Call ``kornia_pnpnet.data.colmap.undistort``. A pixel that cannot be undistorted gets weight 0."""
+        """Undistort pixels with ``kornia_pnpnet.data.colmap.undistort``. A pixel without a solution gets weight 0."""
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -36,9 +36,9 @@ class ImageCorrespondences(NamedTuple):
         except ValueError as error:
             raise InputError("--camera", str(error)) from None
         there = pixels.isfinite().all(-1)
-        weights = torch.where(there, self.weights, 0.0)
+        weights = torch.where(there, self.weights, 0.0).double()
         pixels = torch.where(there[:, None], pixels, matrix[:2, 2])
-        return ImageCorrespondences(self.world_points, pixels, weights, _pinhole(matrix, "--camera"))
+        return ImageCorrespondences(self.world_points.double(), pixels, weights, _pinhole(matrix, "--camera"))
 
 
 def camera_matrix(text: str) -> Tensor:

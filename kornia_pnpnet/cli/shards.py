@@ -24,7 +24,7 @@ __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 #: Formats of shards.
 SUFFIXES = (".npz", ".parquet")
 
-# Key in the metadata of a results file. The value holds the solver's name and the digest of the solver's parameters.
+# Key in the metadata of a results file. The value has the solver's name, and a digest (see `name` in `solve_shards`).
 _SOLVER = b"kornia_pnpnet.solver"
 # Largest number of values that are read from a Parquet file at once: 256 MiB in float64.
 _NUMBERS_AT_ONCE = 2**25
@@ -70,7 +70,7 @@ def solve_shards(
 
     Raises:
         InputError: when there is no shard, when two shards would have results of the same name, when ``out`` is the
-            folder of a shard, or when a shard has results of another solver, other options or other intrinsics.
+            folder of a shard, or when a shard has results of another solver or other weights, options or intrinsics.
         OSError: when the results cannot be written.
     """
     state = chain.from_iterable(sorted(solve.solver.state_dict().items()))

@@ -238,7 +238,7 @@ def align(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tens
 
 
 def span_a_plane(centred: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-    """Tell whether points span a plane, and whether their distances from a line exceed rounding errors, bool (B,) each.
+    """Tell whether points span more than a line, and whether by more than rounding errors, bool (B,) each.
 
     ``centred`` holds points (3, N, B) minus their mean. Coordinates before centring are at most 1, and padding is 0.
     ``share`` (B,) is the inverse of the number of points.

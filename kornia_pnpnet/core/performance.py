@@ -196,7 +196,7 @@ def present_first(present: Tensor) -> Tensor:
 
 
 def ascending_order(keys: Tensor) -> Tensor:
-    """Find the positions (B, N) that sort pairs stably by two ascending keys (2, N, B) without NaN."""
+    """Find the positions (B, N) of the pairs in stable ascending order of two keys (2, N, B) without NaN."""
     if not exporting() and _are_few_pairs(keys):
         return _order_by_counting(*keys).mT
     first, second = keys.mT.contiguous()  # sorting another dimension takes twice the time
@@ -212,7 +212,7 @@ def _ascending(keys: Tensor) -> Tensor:
 
 
 def _order_by_counting(*keys: Tensor) -> Tensor:
-    """Find the indices that sort stably by ascending keys (N, *). The first key has priority."""
+    """Find the indices that sort stably in ascending order of keys (N, *). The first key has priority."""
     first = keys[0]
     position = torch.arange(first.shape[0], device=first.device).view(-1, *(1,) * (first.ndim - 1))
     before = position < position[:, None]  # entry (i, j): whether entry j precedes entry i

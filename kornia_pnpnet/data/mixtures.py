@@ -89,7 +89,7 @@ def _checked_shares(what: str, count: int, shares: Sequence[float] | None) -> li
 
 
 def _split(batch_size: int, shares: Sequence[float], rounded: Callable[[float], int]) -> list[int]:
-    """Return sizes of parts in proportion to the shares. ``rounded`` rounds the bounds between parts to integers."""
+    """Split a batch in proportion to the shares; ``rounded`` rounds the bounds between the parts to integers."""
     bounds = [rounded(batch_size * sum(shares[:i]) / sum(shares)) for i in range(len(shares))]
     return [end - start for start, end in pairwise([*bounds, batch_size])]
 

@@ -52,8 +52,8 @@ class OutlierMix:
             outliers. A mismatch has the pixel of another point. A sensing outlier has a uniform pixel of the image.
         near_share: probability that an outlier is *near*. The pixel of a near outlier is close to its point's pixel.
         near_pixels: range of a near outlier's distance from the pixel of its point, in pixels. Distances are
-            log-uniform. The ends of the range are raised to at least 5 and 10 standard deviations of the pixel noise.
-            ``None`` means 5 to 50 standard deviations.
+            log-uniform. The lower end is raised to at least 5 standard deviations of the pixel noise, and the upper end
+            to at least 10. ``None`` means 5 to 50 standard deviations.
         structured_share: probability that a problem has *structured* outliers. The structured outliers of a problem
             agree on one incorrect pose, as in scenes with repeated structure.
         structured_ratio: range of the ratio of structured outliers to inliers. Each problem draws a uniform ratio.

@@ -170,8 +170,8 @@ class FacadePoints(_View):
     standard deviation of a tenth of the relief.
 
     Args:
-        field_of_view: range of the field of view of the square image, in degrees. The field of view is uniform.
-        window: range of the window's share of the image area. The share is log-uniform. All points lie in the window.
+        field_of_view: range, in degrees, from which the field of view of the square image is drawn uniformly.
+        window: range of the window's share of the image area, drawn log-uniformly. All points lie in the window.
     """
 
     def _depth(self, rays: Tensor, generator: torch.Generator) -> Tensor:

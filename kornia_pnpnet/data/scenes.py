@@ -142,7 +142,7 @@ class SceneProblems(RandomProblems):
 
     @property
     def max_translation(self) -> float:
-        """Largest translation error of a success: 0.2 m, or 0.5 % of the median depth if the unit is arbitrary."""
+        """Limit of the translation error of a success: 0.2 m, or 0.5 % of the median depth if the unit is arbitrary."""
         return 0.2 if self.scene.metric else 0.005 * self.scene.median_depth
 
     def _draw(self, generator: torch.Generator) -> Problems:

@@ -32,7 +32,7 @@ _MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
 
 
 class EvaluationData(NamedTuple):
-    """A set of problems in one batch, and the largest errors of a success."""
+    """A set of problems in one batch, and the limits of a success."""
 
     problems: Problems  #: The problems.
     max_rotation_deg: float = 1.0  #: Limit of the rotation error in degrees.

@@ -1,4 +1,4 @@
-"""The schema of results files, with only the entries that this package reads. The module needs pydantic."""
+"""The schema of results files, limited to the entries that readers use. The module needs pydantic."""
 
 # ruff: noqa: UP013  (one line for each small mapping)
 from __future__ import annotations

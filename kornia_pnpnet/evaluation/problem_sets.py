@@ -20,7 +20,7 @@ __all__ = ["DEFAULT_SEED", "PRIORS", "evaluation_sets"]
 DEFAULT_SEED = 12345
 
 _slab = partial(SyntheticProblems, points=SlabPoints())
-#: Synthetic sources by name. Each value holds the name in results files and ``conf/data``, and a constructor.
+#: Synthetic sources by name. Each value holds the name in results files (some are in ``conf/data``), and a constructor.
 PRIORS: dict[str, tuple[str, Callable[..., SyntheticProblems | MixedProblems]]] = {
     "synthetic": ("paper", SyntheticProblems),
     "gaussian_pose": ("gaussian_pose", partial(SyntheticProblems, translation_sigma=25.0)),
@@ -34,7 +34,7 @@ _DRAW_BATCH = 1000
 
 
 def _read_outliers(text: str, n: int, mismatches_only: bool) -> Iterator[tuple[str, OutlierMix, str | int]]:
-    """Parse ``--outliers``. Yield labels, mixes, and entries of results files (``none``, ``uniform`` or an integer)."""
+    """Parse ``--outliers``. Yield a label, a mix, and the entry of results (``none``, ``uniform`` or an integer)."""
     one, many, share = ("mismatch", "mismatches", 1.0) if mismatches_only else ("outlier", "outliers", 0.5)
     for word in map(str.strip, text.split(",")):
         if word == "uniform":
@@ -78,7 +78,7 @@ def evaluation_sets(
         metric: whether the scenes are in metres.
         mismatches_only: make every outlier a mismatch, and let no two mismatches share a pixel. Otherwise, about half
             of the outliers are mismatches, and the others have random pixels.
-        known_noise: add the standard deviations of the noise to synthetic problems. Points and pixels do not change.
+        known_noise: give synthetic problems the standard deviations of the noise. Points and pixels do not change.
         dtype: dtype of the problems, which are drawn in float64 and then converted.
 
     Returns:

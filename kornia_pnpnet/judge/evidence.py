@@ -291,7 +291,7 @@ def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, 
     second is :func:`within_limits`. The third is the logistic function of ``odds`` (B,), the log-odds of the pose
     against other poses (``None``: no other poses). The result is 0 if the points of almost all inliers lie on a line.
     Implausible noise, for example of mirrored pixels, also gives 0. Where ``known`` (B, 1) is true, noise up to the
-    caller's noise is plausible.
+    caller's noise is plausible, too.
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)

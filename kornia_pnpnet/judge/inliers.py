@@ -1,8 +1,8 @@
 r"""Find the inliers of a pose by thresholds.
 
 A pair is an inlier if its residual :math:`r` satisfies :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`. The threshold
-:math:`\tau` is in pixels. The threshold :math:`\omega` is in the unit of the world points. The *standardised* squared
-residual is the left side of the inequality divided by the right side.
+:math:`\tau` is in pixels. The threshold :math:`\omega` is a shift of the world point, in the unit of the world. The
+*standardised* squared residual is the left side of the inequality divided by the right side.
 """
 
 from __future__ import annotations

@@ -26,11 +26,11 @@ _LIKELY = 1e-3
 # The logarithm of a likelihood ratio is clipped at this number, so that its exponential does not overflow.
 _LIKELIER = 30.0
 # Two poses are the same minimum if their rotations differ by less than _SAME radians, and their camera coordinates of
-# the mean point by less than _SAME times the distance of this point.
+# the mean point by less than _SAME times the distance of this point from the camera.
 _SAME = 0.035
 # A mirror image is refined if most inliers have residuals below this number times the spread of the inliers' pixels.
 _NEAR_MIRROR = 0.2
-# A rival is another candidate. The wide rival is the refined pose with a noise of at least _WIDE_ANGLE (rad).
+# A rival is another pose that may explain the pairs. _WIDE_ANGLE (rad) is the least initial noise of the wide rival.
 _WIDE_ANGLE = 6.4e-3
 # Index of the first entry of `Evidence.grid` whose noise is at least _WIDE_ANGLE.
 _WIDE_FROM = 4
@@ -110,11 +110,11 @@ def reconsider(
 ) -> tuple[Progress, Evidence, Tensor]:
     """Compare refined poses with rivals. If ``refine.by_residual`` is positive, each problem keeps its likeliest pose.
 
-    If a larger noise is almost as likely as the estimate, a rival starts from the refined pose and the larger noise. If
-    the mirror image of the pose has small residuals, a rival starts from the mirror image. If ``replaced`` is ``None``,
-    a given rival is ignored when its rotation is close to the refined rotation, or when nearly all pairs are inliers. A
-    given rival starts with the noise of its own residuals. If ``refine.by_residual`` is 0, only mirror images and
-    rivals selected by ``replaced`` are tried. Rivals rotated by over 10 degrees lower the result's probability.
+    If the noise is unknown and a larger noise is almost as likely, a rival starts from the refined pose and the larger
+    noise. If the mirror image of the pose has small residuals, a rival starts from the mirror image. If ``replaced`` is
+    ``None``, a given rival is ignored when its rotation is close to the refined rotation, or when nearly all pairs are
+    inliers. A given rival starts with the noise of its own residuals. If ``refine.by_residual`` is 0, only mirror
+    images and rivals of ``replaced`` are tried. Rivals that end over 10 degrees from the result lower its probability.
 
     Args:
         refine: the refiner.

@@ -37,7 +37,7 @@ _CASE_ITERATIONS = 2
 # Upper bound of a squared reprojection error, in squared focal lengths. A point behind the camera has this error.
 _MAX_SQ_RESIDUAL = 4.0
 # Size of the ridge of `_null_space`, divided by the squared spread of the pixels. If null vectors have equal errors,
-# the ridge sorts them by the extent of the world, in descending order.
+# the ridge sorts them by the extent of the world along them, in descending order.
 _TIE = 1e-4
 # Indices (m, n) of the products βₘβₙ, which are the unknowns of `_four_cases`.
 _PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (0, 3))
@@ -254,7 +254,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
 
 
 def _normal_equations(system: _DepthSystem, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""For `_minimize`: half the normal matrix (4, 4, C, B), half the gradient (4, C, B), DᵀD - LᵀL (3, 3, C, B)."""
+    r"""For `_minimize`: the normal matrix (4, 4, C, B), half the gradient (4, C, B), and DᵀD - LᵀL (3, 3, C, B)."""
     vectors = _in_camera(system, depths)[:, 1:]
     columns = vectors.transpose(0, 1)
     misfit = small_product(columns, vectors) - system.gram

@@ -15,8 +15,8 @@ be the squared determinant of the matrix of the three rays. The conic is a pair 
 One root of this cubic equation gives two lines. Each line intersects a second conic (other weights) in two points. A
 Newton step then refines the ratios of the distances.
 
-The last dimension of every tensor has the C problems of a chunk. ``lerp`` with the weight 0 or 1 selects finite values.
-On a CPU, ``torch.where`` is ten times slower if its mask is unpredictable.
+The last dimension of every tensor has the C problems of a chunk. Finite values are selected by ``lerp`` with a weight
+of 0 or 1, because ``torch.where`` with an unpredictable mask is ten times slower on a CPU.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _turn_to_largest(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _turned(triple: Tensor, turn: tuple[Tensor, Tensor], step: int = 1) -> Tensor:
-    """Shift triples (3, *, C) cyclically by the flags of `_turn_to_largest`. With ``step=-1``, undo the shift."""
+    """Shift triples (3, *, C) as `_turn_to_largest` says: the largest comes first. With ``step=-1``, undo the shift."""
     return triple.lerp(triple.roll(-step, 0), turn[0]).lerp_(triple.roll(step, 0), turn[1])
 
 
@@ -89,7 +89,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """Of a cubic form with coefficients (4, C), find the real root ``u : v`` that is farthest from the other two roots.
 
-    Two nearly equal solutions of P3P give two nearly equal roots. The third root's conic has a line through both.
+    Two nearly equal solutions of P3P give two nearly equal roots. The third root gives a line through both solutions.
     """
     tiny = torch.finfo(k.dtype).tiny
     sizes = k.abs()
@@ -414,7 +414,7 @@ class P3P(Configured):
         super().__init__(locals())
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
-        """Four slots for each sample at each focal length of the grid. See MinimalSolver.hypotheses."""
+        """Four slots for each sample and each tried focal length. See MinimalSolver.hypotheses."""
         world, plane = problem.world_points, problem.img_points / problem.focal
         if problem.free_focal is None:
             entries, valid = minimal_poses(world, plane)

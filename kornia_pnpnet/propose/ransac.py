@@ -45,13 +45,13 @@ class RANSAC(Initialiser):
 
     The samples of all problems are solved as one batch, in rounds. If a round finds a better pose, least squares on
     the inliers improve this pose (LO-RANSAC). The search of a problem ends when the probability of at least one sample
-    without outlier reaches ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
+    without outliers reaches ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
     drawn twice. All problems and calls use the same random numbers. Except for rounding, the result of a problem
     therefore does not depend on the batch. Pairs with a larger confidence are drawn more often.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
-    least squares, an inlier has a weight without gradient: :math:`\tau^2` divided by the limit of :math:`\|r\|^2`. The
-    final steps also use the weights of a Cauchy kernel. The final steps start from a detached pose close to the
+    least squares, the weight of an inlier is :math:`\tau^2` divided by the right-hand side, without gradient. The final
+    steps multiply this weight by that of a Cauchy kernel. The final steps start from a detached pose close to the
     minimum, and have gradients with respect to points, pixels and weights. The choice of inliers has no gradient.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,

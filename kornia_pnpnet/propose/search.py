@@ -36,7 +36,7 @@ _SAMPLES_AT_ONCE = 8192
 # A round has _GROWTH times the samples of all earlier rounds, but at least `min_samples` and at most _LARGEST_ROUND.
 _GROWTH, _LARGEST_ROUND = 0.5, 4096
 # A round draws all remaining samples if they fill at most _ROUNDS_LEFT rounds, or if at most _FEW_SAMPLES are left.
-# If all samples are drawn, the pose does not depend on the order of pairs, and rounding does not decide when to stop.
+# With few pairs, the pose then does not depend on the order of pairs, and rounding does not decide when a search ends.
 _ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
 # After k samples, the first scoring of a round uses _PAIRS_BY_SAMPLES * k^(1/3) pairs, but at least _FIRST_PAIRS. If k
 # samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Among 3 / w pairs,
@@ -58,8 +58,8 @@ _WIDER = 16.0
 _FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step. The damping is small, because the start is close to the minimum.
 _DAMPING = 1e-6
-# Factors of the inlier threshold in the first and in the second least-squares step. Inliers of a minimal sample's pose
-# have larger residuals than inliers of an improved pose.
+# Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
+# the pose of a minimal sample than at an improved pose.
 _LIMITS = 3.0, 1.0
 # If `pose_sigma` exceeds _OPEN, at least _OPEN_SAMPLES samples are drawn, because an incorrect pose may have as many
 # inliers as the correct pose. An example is a flat scene in a narrow field of view.

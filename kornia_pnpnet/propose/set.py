@@ -50,7 +50,7 @@ _SAMPLES = ((0, 1, 2), (0, 1, 3), (2, 3, 4), (2, 3, 5), (0, 4, 5), (1, 4, 5), (0
 # For each entry (n, f), problems of at least n pairs also use _SAMPLES with all ranks multiplied by f. If the likeliest
 # pairs agree on an incorrect pose, the samples of larger ranks help.
 _SPREADS = ((18, 3), (24, 4), (30, 5))
-# 25 further samples of the 25 likeliest pairs, for problems of at least 36 pairs. No two samples share two pairs.
+# 25 further samples of the 25 likeliest pairs, for problems of at least 36 pairs. No two of the 25 share two pairs.
 _RING_FROM = 36
 _RING = [(a, b, c) for i in range(25) for a, b, c in [sorted((i, (i + 1) % 25, (i + 6) % 25))]]
 # Number of likeliest pairs that score each hypothesis.
@@ -135,7 +135,7 @@ class _View:
 
 @torch.no_grad()
 def _repeats(problem: Problem) -> Tensor:
-    """For each pair, the log of the number of pairs with the same pixel, and with the same world point, (B, N, 2)."""
+    """Logarithms (B, N, 2) of two counts: the pairs that share the pixel of a pair, and those that share its point."""
     there = problem.usual_weights > 0
     return torch.stack([copies(x, there) for x in (problem.img_points, problem.world_points)], -1).log()
 

@@ -31,9 +31,9 @@ class RobustKernel(NamedTuple):
 
     Attributes:
         loss: ``loss(sq_residual, shape)``, which is 0 for a residual of 0 and never decreases.
-        weight: ``weight(sq_residual, shape)``, the derivative of ``loss`` with respect to ``sq_residual``. Weights that
-            can be smaller than the square root of the smallest float32 need a lower bound, or gradients become NaN.
-        default: the shape that is used when none is given; for a scale, in pixels.
+        weight: ``weight(sq_residual, shape)``, the derivative of ``loss`` with respect to ``sq_residual``. A weight
+            that falls exponentially needs a lower bound, or gradients become NaN.
+        default: the shape that is used when none is given. Default scales are meant for residuals in pixels.
         lower: the smallest shape that may be learned.
         upper: the largest shape that may be learned.
         logarithmic: whether the shape is a scale and is therefore learned in log space.

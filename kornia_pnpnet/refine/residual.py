@@ -46,8 +46,8 @@ __all__ = [
 
 #: A point ``x`` of depth ``z <= MIN_DEPTH_RATIO * |x|`` is behind the camera. Otherwise ``|x / z|`` is below 1000.
 MIN_DEPTH_RATIO = 1e-3
-# Largest change of the zoom (the logarithm of the focal length) and of a coefficient of radial distortion in one step.
-# The exponential of a larger change could overflow.
+# Largest change of the logarithm of the focal length, and of a coefficient of radial distortion, in one step. The
+# exponential of a larger change of the logarithm could overflow.
 _LARGEST_ZOOM, _LARGEST_RADIAL = 1.0, 0.3
 # Lower bound of the denominator 1 + tr(R) in `tangent`. At a half turn, 1 + tr(R) is 0.
 _LEAST_DENOMINATOR = 1e-4

@@ -86,7 +86,7 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
 
 
 def add_term(equations: NormalEquations, linear: Linear, focal: Tensor) -> NormalEquations:
-    """Add a term to normal equations that are linearised at the same state. ``focal`` is a scalar or (B,)."""
+    """Add a term, linearised at the same state, to the normal equations. ``focal`` is a scalar or (B,)."""
     weighted = torch.bmm(linear.jacobian.mT, linear.information)  # (B, 6 + K, D)
     weight = linear.weight / (focal if equations.unit is None else equations.unit[:, 0] * focal)
     matrix = torch.bmm(weighted, linear.jacobian).permute(1, 2, 0) * (weight / focal)
@@ -142,7 +142,7 @@ class PoseTerm(NamedTuple):
         information: inverse covariance of the pose, shape :math:`(B, 6, 6)`.
         offset: the position of the problem's origin in the caller's world, in the unit of the problem, shape
             :math:`(B, 3)`. Translation errors are errors at the origin of the caller's world.
-        free: axis (camera frame) of unknown rotation; 0 unless exactly one such axis exists, :math:`(B, 3)`.
+        free: the only axis in the camera frame about which the rotation is unknown, or 0, shape :math:`(B, 3)`.
         sq_scale: squared scale of the robust kernel, in squared standard deviations, shape :math:`(B,)`.
         rank: number of directions in which the prior has information, shape :math:`(B,)`.
     """
