@@ -100,20 +100,22 @@ def main(config: DictConfig) -> float | None:
         again = continuing(*sweep, "resume=true")
         log.warning("Stopped at update %s of %s. Continue with: %s", report.update, settings.updates, again)
         sys.exit(130)
-    if report.start == report.update and (folder / RESULTS_NAME).exists():
-        log.info("Nothing is left to train; the results stay as they are.")
+    results = None
+    if report.start == report.update and (folder / RESULTS_NAME).exists() and (folder / "weights").is_dir():
         try:
             results = load_run(folder / RESULTS_NAME)
         except ValueError as error:
             if sweeps:
                 raise
             sys.exit(str(error))
+    if results is not None and results.run.update == report.update:
+        log.info("Nothing is left to train; the results stay as they are.")
     else:
         log.info("Measuring success and speed of the trained solver")
         results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task), origin)
-        write_json(folder / RESULTS_NAME, to_json(results))
         model.save_pretrained(folder / "weights")
         write_model_card(folder / "weights", results)
+        write_json(folder / RESULTS_NAME, to_json(results))  # the last file: a run without it is measured again
     for name, entry in results.validation.items():
         about = config.data.get("about", {}).get(name, "see the configuration")
         log.info("%s (%s): success %s", name, about, entry.success)

@@ -125,7 +125,7 @@ def checked_inputs(
     init, prior, rig = inputs.init, inputs.prior, inputs.rig
     inputs = inputs._replace(
         init=init and with_rotation(init),
-        prior=prior and prior._replace(pose=with_rotation(prior.pose)),
+        prior=prior and prior._replace(pose=with_rotation(Pose(*prior.pose))),
         rig=rig and with_rotation(rig),
     )
     if is_bearing:

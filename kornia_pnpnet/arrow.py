@@ -81,6 +81,8 @@ class Solve:
         if intrinsics is not None:
             check_form(["3", "3"], intrinsics=intrinsics)
             intrinsics = intrinsics.float()
+        if options and not isinstance(solver, str):
+            raise ValueCheckError(f"Options are for the name of a solver, got a module and {sorted(options)}.")
         self.solver = create_solver(solver, **options) if isinstance(solver, str) else solver
         self.intrinsics = intrinsics
 

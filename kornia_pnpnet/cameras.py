@@ -100,15 +100,20 @@ def undistort(
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
     """Replace distorted pixels by pixels of pinhole cameras, see :func:`undistort`.
 
-    Pairs whose pixel cannot be undistorted are masked out. A non-finite pixel is kept, and makes its problem invalid.
+    Pairs whose pixel cannot be undistorted are masked out. A non-finite pixel, an invalid camera, and coefficients that
+    are not finite make their problem invalid.
     """
     # Rounding errors depend on the memory layout, but results must not depend on the layout of the inputs.
     inputs, dist, fisheye = map_tensors(torch.Tensor.contiguous, (inputs, dist, fisheye))
-    broken = ~inputs.img_points.isfinite().all(-1)
+    lens = dist if fisheye is None else fisheye
+    assert lens is not None
+    unusable = ~lens.detach().isfinite().all(-1)[:, None]
+    broken = ~inputs.img_points.isfinite().all(-1) | ~pinholes(inputs.intrinsics)[1][:, None] | unusable
     seen = torch.where(broken[..., None], 0.0, inputs.img_points)
     pixels, found, noise = undistort(seen, inputs.intrinsics, dist, fisheye, inputs.noise)
     mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
-    return inputs._replace(img_points=torch.where(broken[..., None], inputs.img_points, pixels), mask=mask, noise=noise)
+    pixels = torch.where(broken[..., None], inputs.img_points, pixels)
+    return inputs._replace(img_points=torch.where(unusable[..., None], torch.nan, pixels), mask=mask, noise=noise)
 
 
 @full_precision
@@ -146,7 +151,8 @@ def bearings(
     size, tensors = img_points.shape[:-2], {"intrinsics": intrinsics, "dist": dist, "fisheye": fisheye}
     given = {name: x for name, x in tensors.items() if x is not None}
     entries = {name: (3, 3) if name == "intrinsics" else (x.shape[-1],) for name, x in given.items()}
-    check_shapes({name: (x, (*size[: x.ndim - len(entries[name])], *entries[name])) for name, x in given.items()})
+    leading = {name: size if x.ndim > len(entries[name]) else () for name, x in given.items()}
+    check_shapes({name: (x, (*leading[name], *entries[name])) for name, x in given.items()})
     check_devices(given, img_points, "img_points")
     dtype = common_dtype({"img_points": img_points, **given})
     pixels = img_points.to(dtype).reshape(size.numel(), *img_points.shape[-2:])

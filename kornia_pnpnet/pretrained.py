@@ -31,6 +31,8 @@ _FINGERPRINT = "sha256"
 _LARGEST_CONFIG = 2**20
 # Integers up to this value are accepted in every configuration, because tensors of these sizes take little memory.
 _SMALL = 1000
+# Options in pixels, which are sizes of no tensor.
+_LENGTHS = ("f_const", "img_scale")
 
 
 def shipped_weights() -> list[str]:
@@ -81,7 +83,7 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
         name, entry = entries.pop()
         if isinstance(entry, dict):
             entries += entry.items()
-        elif isinstance(entry, int) and entry > (len(state) if name == "layers" else largest):
+        elif isinstance(entry, int) and name not in _LENGTHS and entry > (len(state) if name == "layers" else largest):
             raise ValueCheckError(f"{folder / CONFIG_NAME}: {name} is {entry}, too large for {WEIGHTS_NAME}.")
     return config, state
 
@@ -141,7 +143,8 @@ class PretrainedMixin(nn.Module):
 
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
         """Copy the solver with another refinement or other options. The copy and the solver share unchanged modules."""
-        return type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
+        copied = type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
+        return copied.train(self.training)
 
     def config(self) -> dict[str, Any]:
         """The constructor arguments of all parts, and the options, as plain data."""

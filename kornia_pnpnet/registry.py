@@ -142,7 +142,7 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
 @lru_cache(maxsize=8)
 def _on_device(name: str, device: torch.device) -> nn.Module:
-    with device:
+    with torch.inference_mode(False), device:  # the parameters must also serve calls that record gradients
         return create_solver(name)
 
 

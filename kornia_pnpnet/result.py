@@ -145,7 +145,7 @@ class Pose(NamedTuple):
             tensor([[345., 240.]])
         """
         leading = self.translation.shape[:-1]
-        batch, matrices = leading.numel(), camera_matrices(intrinsics)
+        batch, matrices = leading.numel(), camera_matrices(intrinsics).to(self.translation.dtype)
         if matrices.ndim > 2:
             of_cameras = (batch,) if isinstance(intrinsics, PinholeCamera) else leading
             check_shapes({"intrinsics": (matrices, (*of_cameras, 3, 3))})

@@ -262,13 +262,7 @@ class PnPNet(PretrainedMixin):
             cam_from_rig=cam_from_rig,
         )
         check_whole(0, alternatives=alternatives)
-        rig = inputs.rig is not None
-        if self.focal == "unknown" and (rig or dist is not None or fisheye is not None):
-            raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
-        if rig and (alternatives or (self.init is None and inputs.init is None)):
-            raise ValueCheckError(
-                "`cam_from_rig` and bearings as `img_points` need an initialiser or `init`, and exclude `alternatives`."
-            )
+        rig = self._is_rig(inputs, dist, fisheye, alternatives)
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
         compiled = self._run.compiled or self._whole.compiled
         plain = not (compiled or needs_graph((*iter_tensors(inputs), *self.parameters())))
@@ -301,10 +295,23 @@ class PnPNet(PretrainedMixin):
         the inputs. The ``ok`` of the starts says whether the problem is valid.
         """
         size, inputs = checked_inputs(*args, **options)
+        self._is_rig(inputs, options.get("dist"), options.get("fisheye"))
         with in_full_precision(inputs.world_points.device.type):
             call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always")
             attempt = self._attempt(self._with_camera(inputs)[0], call)
             return restore_leading(size, (attempt.result, attempt.frame.undo_starts(attempt.starts)))
+
+    def _is_rig(self, inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None, alternatives: int = 0) -> bool:
+        """Refuse arguments that exclude each other, and tell whether the problems are rigs."""
+        rig = inputs.rig is not None
+        if self.focal == "unknown" and (rig or dist is not None or fisheye is not None):
+            raise ValueCheckError("focal='unknown' takes pixels of one camera without dist and fisheye.")
+        if rig and (alternatives or (self.init is None and inputs.init is None and inputs.prior is None)):
+            raise ValueCheckError(
+                "`cam_from_rig` and bearings as `img_points` need an initialiser, `init` or `prior`, and exclude "
+                "`alternatives`."
+            )
+        return rig
 
     def compile(self, mode: str | None = None, *, whole: bool = False) -> None:
         """Compile the first stage, one iteration and the final stage of the solver in place, with ``torch.compile``.
@@ -359,7 +366,7 @@ class PnPNet(PretrainedMixin):
             camera = torch.cat((torch.zeros_like(inputs.radial[:, :1]), inputs.radial), 1)
             starts = starts._replace(camera=camera)
         plan = self._run(self.refine.begin, seen, starts)
-        more = _MORE_ITERATIONS if nominal or self.radial else 0
+        more = _MORE_ITERATIONS if (nominal or self.radial) and not call.first_stage_only else 0
         plan, now = self.refine.iterate(plan, 0 if call.first_stage_only else None, more=more, run=self._run)
         if compares:
             found = plan.evidence_at(now.state)

@@ -472,7 +472,7 @@ def copies_are_the_same(case: Case) -> None:
     """Copied and pickled; saved and loaded again, unless it is a sampler."""
     call, _ = make(case)
     solver = build(case)
-    copies = [copy.deepcopy(solver), pickle.loads(pickle.dumps(solver))]
+    copies = [copy.deepcopy(solver), pickle.loads(pickle.dumps(solver)), solver.with_options()]
     if not case.is_ransac:
         with tempfile.TemporaryDirectory() as folder:
             solver.save_pretrained(folder)

@@ -230,6 +230,8 @@ def test_what_cannot_be_combined_is_refused():
         (lambda: solver(points, pixels, intrinsics, alternatives=1, **rigs), "alternatives"),
         (lambda: PnPNet()(points, pixels, intrinsics, **rigs), "initialiser"),
         (lambda: solver(points, pixels, None), "intrinsics"),
+        (lambda: create_solver("epnp", focal="unknown").with_starts(points, pixels, CAMERA, dist=dist), "unknown"),
+        (lambda: bearings(pixels.expand(2, 2, -1, -1), CAMERA.expand(2, 3, 3)), "intrinsics"),
     ):
         with pytest.raises(BaseError, match=match):
             call()

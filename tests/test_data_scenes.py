@@ -281,6 +281,8 @@ def test_any_camera_is_undistorted(camera, pycolmap):
     lens = pycolmap.Camera(model=model, width=int(width), height=int(height), params=list(map(float, parameters)))
     rays = torch.cat(((found - matrix[:2, 2]) / matrix.diagonal()[:2], torch.ones(3, 1)), 1)
     assert_close(torch.tensor(lens.img_from_cam(rays.numpy())), pixels, rtol=0, atol=1e-6)
+    if "FISHEYE" in camera:  # no ray in front of the camera
+        assert undistort(camera, torch.tensor([[1200.0, 240.0]]))[1].isnan().all()
 
 
 @pytest.mark.parametrize("camera", ["FOO,640,480,500", "PINHOLE,640,480,500", "PINHOLE,a,b", ""])

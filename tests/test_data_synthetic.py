@@ -249,21 +249,14 @@ def test_outliers_are_at_random_positions(n):
     assert (together[~torch.eye(n, dtype=torch.bool)] - expected).abs().max() < 4.5 * math.sqrt(expected / COUNT)
 
 
-def test_mismatches_have_their_share(generator):
+def test_kinds_of_outliers_have_their_shares_and_pixels(generator):
     found = OutlierMix(count=3, mismatch_share=0.2).draw(COUNT, 9, generator).flatten().bincount()
     assert found[OutlierKind.INLIER] == 6 * COUNT
     assert_counts(found[[OutlierKind.MISMATCH, OutlierKind.SENSING]], (0.2, 0.8))
-
-
-def test_sensing_pixels_are_anywhere_in_the_image():
     p = draw(9, 5000, outliers=OutlierMix(count=3, mismatch_share=0.0), half_image=10.0, img_sigma=0.0)
-    assert_uniform(p.img_points[~p.inliers][:, 0], -10, 10)
-    assert_uniform(p.img_points[~p.inliers][:, 1], -10, 10)
-
-
-def test_mismatched_pixels_belong_to_another_point_of_the_box():
-    p = draw(9, 5000, outliers=OutlierMix(count=3, mismatch_share=1.0), world_sigma=0.0, img_sigma=0.0)
-    plain = draw(9, 5000, world_sigma=0.0, img_sigma=0.0)
+    assert_uniform(p.img_points[~p.inliers], -10, 10)
+    mixes = OutlierMix(count=3, mismatch_share=1.0), None
+    p, plain = (draw(9, 5000, outliers=mix, world_sigma=0.0, img_sigma=0.0) for mix in mixes)
     assert reprojection_errors(p)[p.inliers].abs().max() < 1e-8
     assert (reprojection_errors(p)[~p.inliers].norm(dim=-1) > 1.0).double().mean() > 0.999
     # Distributed like the pixels of inliers: the deciles hold a tenth each.

@@ -138,7 +138,7 @@ def test_information_beside_a_zero_of_the_diagonal_is_refused_in_every_unit(size
     problems = make_problems(n=9, batch=2, outliers=0)
     information = torch.diag(torch.tensor([100.0, 0.0, 100.0, 0.0, 0.0, 0.0], dtype=torch.float64)).repeat(2, 1, 1)
     information[0, 4, 3] = 1e-5 / size**2
-    prior = PosePrior(Pose(problems.pose.rotation, size * problems.pose.translation), information)
+    prior = PosePrior((problems.pose.rotation, size * problems.pose.translation), information)  # a plain tuple
     result = create_solver("epnp-lm")(size * problems.world_points, *problems[1:3], prior=prior)
     assert result.status.tolist() == [Status.NOT_FINITE, Status.SOLVED]
 

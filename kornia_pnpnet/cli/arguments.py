@@ -96,6 +96,7 @@ _UNIT = _flag("the scene is not in metres: success needs a translation error bel
 _SOLVER = _arg("a name of `pnpnet list`, or a folder of weights", "NAME", default="pnpnet-set")
 _MATCHES = """CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with world_points (N, 3), img_points (N, 2)
 and optionally weights (N,) and intrinsics (3, 3)"""
+_INTRINSICS = "the camera in pixels; replaces that of an NPZ file; with --batch, for shards without intrinsics"
 _CAMERA = """a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example
 SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; reprojection errors then refer to undistorted pixels"""
 _FOCAL = "unknown: estimate the focal length; SIGMA: improve the given one, which has this relative error, such as 0.1"
@@ -110,7 +111,7 @@ _DURATION = "approximate duration of the training; 0 skips the training"
 ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
     "solve": {
         "file": _arg(_MATCHES, "FILE", nargs="+", type=_path),
-        "--intrinsics": _arg("the camera in pixels; replaces the intrinsics of an NPZ file", "fx,fy,cx,cy"),
+        "--intrinsics": _arg(_INTRINSICS, "fx,fy,cx,cy"),
         "--camera": _arg(_CAMERA, "MODEL,w,h,PARAMS"),
         "--focal": _arg(_FOCAL, "known|unknown|SIGMA", type=_focal),
         "--solver": _SOLVER,

@@ -95,6 +95,7 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
 
 def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     import torch
+    from kornia.geometry.calibration import distort_points
 
     from kornia_pnpnet import Status, diagnose
     from kornia_pnpnet.cameras import reproject
@@ -122,7 +123,10 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         uncertain = {"focal": focal, "focal_sigma": getattr(solver, "focal_sigma", None)}
         covariance = result.covariance(*pairs, result.intrinsics, **uncertain)
     camera, ok, status = result.intrinsics[0], bool(result.ok), Status(int(result.status)).name.lower()
-    pixels = reproject(world_points, camera, result.pose)[0]
+    pixels = reproject(world_points, camera, result.pose)
+    if result.dist.any():
+        pixels = distort_points(pixels, result.intrinsics, result.dist)
+    pixels = pixels[0]
     errors, limit = (pixels - img_points).norm(dim=-1), arguments.threshold
     inliers, sigma = int(result.inliers.sum()), result.sigma.item()
     rejected = ~(result.inliers[0] if limit is None else errors <= limit) | ~result.ok  # no pose: reject all
@@ -141,7 +145,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         "translation_sigma": _finite(deviations[3:6]),
         "quaternion_wxyz": result.pose.quaternion[0].tolist(),
         "intrinsics": camera.tolist(),
-        **({"focal_sigma_px": _finite(deviations[6:] * camera[0, 0])[0]} if focal == "unknown" else {}),
+        **({"dist": result.dist[0].tolist()} if result.dist.any() else {}),
+        **({"focal_sigma_px": _finite(deviations[6:] * camera[0, 0].abs())[0]} if focal == "unknown" else {}),
         **({"diagnosis": diagnosis} if diagnosis else {}),
         "cost": result.cost.item(),
         "rejected_above_px": limit,

@@ -19,6 +19,8 @@ __all__ = ["load_scene", "undistort"]
 
 # Possible folders of a model, relative to the user's folder. ETH3D and COLMAP use different sub-folders.
 _MODEL_FOLDERS = (".", "dslr_calibration_undistorted", "sparse/0", "sparse")
+# Largest distance in pixels between a pixel and the distorted form of its undistorted pixel.
+_ROUND_TRIP = 0.5
 
 
 def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, max_error_px: float = 10.0) -> Scene:
@@ -108,6 +110,8 @@ def _pinhole(camera: Any, distorted: np.ndarray) -> tuple[np.ndarray, np.ndarray
     intrinsics = camera.calibration_matrix()
     plane = camera.cam_from_img(distorted)  # (M, 2), NaN where the camera model has no inverse
     with np.errstate(invalid="ignore"):  # a focal length of 0 makes `plane` infinite
+        again = camera.img_from_cam(np.column_stack((plane, np.ones(len(plane)))))
+        plane[np.abs(again - distorted).max(1, initial=0.0) > _ROUND_TRIP] = np.nan  # for example beyond 90 degrees
         return intrinsics, plane @ intrinsics[:2, :2].T + intrinsics[:2, 2]
 
 

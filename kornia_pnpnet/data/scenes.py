@@ -87,8 +87,8 @@ class Scene:
 
     @property
     def median_depth(self) -> float:
-        """Median depth of the observed points of all images, in the unit of the scene."""
-        return torch.cat([view.cam_points[:, 2] for view in self.views]).median().item()
+        """Median depth of the inliers of all images, in the unit of the scene."""
+        return torch.cat([view.cam_points[view.inliers, 2] for view in self.views]).median().item()
 
 
 @dataclass(kw_only=True, eq=False)

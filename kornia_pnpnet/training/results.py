@@ -3,6 +3,7 @@
 # ruff: noqa: UP013  (one line for each small mapping)
 from __future__ import annotations
 
+import json
 import timeit
 import warnings
 from collections.abc import Mapping
@@ -196,7 +197,7 @@ def run_results(
         validation=validate(model, validation),
         learned=Learned(*(values.tolist() for values in learned)),
         model=model_config,
-        config=config,
+        config=json.loads(json.dumps(config), parse_constant=str),  # JSON has no infinity
         environment=made_with,
         origin=origin,
     )

@@ -11,6 +11,7 @@ from hydra.experimental.callback import Callback
 from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.core.tables import markdown_table
 from kornia_pnpnet.training.card import HOW_IT_RAN
+from kornia_pnpnet.training.results import summarize_runs
 
 # The column of a summary that follows the overrides.
 _FIRST_RESULT = "update"
@@ -21,8 +22,8 @@ class SweepTable(Callback):
 
     def on_multirun_end(self, config: Any, **_: Any) -> None:
         """Print the table, and the path of the summary that the runs have written into the sweep's folder."""
-        path = Path(config.hydra.sweep.dir) / "summary.csv"
-        if not path.is_file():
+        path = summarize_runs(Path(config.hydra.sweep.dir))  # runs side by side may have overwritten each other's rows
+        if path is None:
             return
         rows = list(read_csv(path, ["run", _FIRST_RESULT, "us_per_problem"]).values())
         columns = list(rows[0])
