@@ -254,7 +254,8 @@ def test_kinds_of_outliers_have_their_shares_and_pixels(generator):
     assert found[OutlierKind.INLIER] == 6 * COUNT
     assert_counts(found[[OutlierKind.MISMATCH, OutlierKind.SENSING]], (0.2, 0.8))
     p = draw(9, 5000, outliers=OutlierMix(count=3, mismatch_share=0.0), half_image=10.0, img_sigma=0.0)
-    assert_uniform(p.img_points[~p.inliers], -10, 10)
+    assert_uniform(p.img_points[~p.inliers][:, 0], -10, 10)
+    assert_uniform(p.img_points[~p.inliers][:, 1], -10, 10)
     mixes = OutlierMix(count=3, mismatch_share=1.0), None
     p, plain = (draw(9, 5000, outliers=mix, world_sigma=0.0, img_sigma=0.0) for mix in mixes)
     assert reprojection_errors(p)[p.inliers].abs().max() < 1e-8

@@ -142,8 +142,7 @@ def test_cameras_at_a_pose_project_as_we_do(make_problems):
         assert camera.extrinsics.equal(p.pose.matrix)
     assert camera.height.tolist() == [7.0] * 5  # that of the camera that came
     shared = p.pose.camera(p.intrinsics[0].float(), height=480, width=640)
-    assert shared.intrinsics.dtype == torch.float64
-    assert shared.intrinsics.shape == (5, 4, 4)
+    assert (shared.intrinsics.dtype, shared.intrinsics.shape) == (torch.float64, (5, 4, 4))
     assert shared.width.tolist() == [640.0] * 5
     nested = Pose(*(x.unflatten(0, (1, 5)) for x in p.pose)).camera(camera)  # Kornia's cameras are one batch
     assert nested.extrinsics.equal(camera.extrinsics)

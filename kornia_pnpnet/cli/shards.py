@@ -181,9 +181,9 @@ def _tables_of_arrays(shard: Path, batch: int) -> Iterator[pa.Table]:
         if name in arrays and arrays[name].shape == shape:  # one value for all problems
             arrays[name] = np.broadcast_to(arrays[name], (count, *shape))
     if wrong := [name for name, array in arrays.items() if array.ndim == 0 or len(array) != count]:
-        raise InputError(shard, f"{wrong[0]} does not have one entry for each of {count} problems")
+        raise InputError(shard, f"the arrays are not of {count} problems each: {', '.join(wrong)}")
     for start in range(0, max(count, 1), batch):
         try:
             yield pa.table({name: list_column(array[start : start + batch]) for name, array in arrays.items()})
         except (TypeError, pa.ArrowException) as error:
-            raise InputError(shard, f"the arrays are not of {count} problems each: {error}") from None
+            raise InputError(shard, f"an array does not hold real numbers: {error}") from None
