@@ -41,7 +41,7 @@ class Frame(NamedTuple):
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
         img_scale: factor from the caller's pixels to the problem's pixels (geometric mean of the absolute factors of u
-            and v), shape :math:`(B,)`. In a rig, the factor is the mean over the pairs.
+            and v), shape :math:`(B,)`. In a rig, the factor is the geometric mean over the pairs.
         order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices, scaled to a last entry of 1, shape :math:`(B, 3, 3)`, or :math:`(B, N, 3, 3)`
@@ -268,7 +268,7 @@ class Normalize(Configured):
         mean_scale = img_scale[0]
         if rig is not None:  # a problem without pairs gets the scale 1
             share = there.to(rows.dtype) / number.clamp(min=1)
-            mean_scale = torch.where(there.any(0), (img_scale * share).sum(0), 1.0)
+            mean_scale = torch.where(there.any(0), (img_scale.log() * share).sum(0).exp(), 1.0)
         frame = Frame(centroid.mT, size, mean_scale, order, status, matrices, ignored)
         if noise is not None:
             sound = (there & has_noise).mT

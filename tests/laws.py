@@ -255,6 +255,16 @@ def padding_is_nothing(case: Case) -> None:
         assert_near(cut(found), cut(expected))
 
 
+def unknown_sigmas_are_ignored(case: Case) -> None:
+    """Without a known sigma, nothing changes. A refiner takes an unknown sigma for the mean of the known ones."""
+    call, _ = make(case)
+    nan = torch.full_like(call["world_points"][..., 0], math.nan)
+    assert_near(build(case)(**call, img_sigma=nan), build(case)(**call))
+    if not case.solver.endswith("-set"):
+        some = torch.where(torch.arange(nan.shape[1]) % 2 > 0, 2.0, nan)
+        assert_near(build(case)(**call, img_sigma=some), build(case)(**call, img_sigma=2.0))
+
+
 def units_are_free(case: Case) -> None:
     """World, pixels and weights may count in any unit, together with all that is measured in it."""
     call, _ = make(case)
@@ -510,6 +520,7 @@ OF_BELIEVED = (batches_are_free, shuffled_is_ordered, units_are_free, frames_are
 NOT_OF_PEERS = (shuffled_is_ordered, units_are_free, frames_are_free, gradients_reach_the_inputs, copies_are_the_same)
 LAWS = [sound, *OF_BELIEVED, padding_is_nothing, reflections_are_free, bad_problems_fail_alone]
 LAWS += [gradients_reach_the_inputs, isotropic_covariances_are_sigmas, half_precision_is_converted]
+LAWS += [unknown_sigmas_are_ignored]
 LAWS += [defaults_are_free, copies_are_the_same, wrong_arguments_are_refused]
 
 
@@ -521,6 +532,8 @@ def applies(law: Callable[[Case], None], case: Case) -> bool:
     """
     if law is isotropic_covariances_are_sigmas:
         return case.noise == "sigma"
+    if law is unknown_sigmas_are_ignored:
+        return case.noise == "none" and case.solver not in PEERS and not case.solver.startswith("net-")
     if case.solver in PEERS:
         return law not in NOT_OF_PEERS
     of_networks = gradients_reach_the_inputs, padding_is_nothing, *OF_BELIEVED

@@ -478,10 +478,22 @@ def taken(tree: _T, index: Tensor) -> _T:
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
     """Complete the noise of every pair. The initialiser gives the sigmas, and the caller gives the covariances.
 
-    If the initialiser gives no noise, sigmas are from the caller, or 0 where unknown. Without noise, return ``None``.
+    If the initialiser gives no noise, the mean of the problem's known sigmas replaces each unknown sigma. If no sigma
+    is known, points get 0, and pixels get 1 (one pixel of the caller if there are terms), as without noise. If neither
+    gives noise, return ``None``.
     """
     given = starts.noise if problem.noise is None else problem.noise
     if given is None:
         return None
-    noise = map_tensors(lambda x: x.nan_to_num(0.0), given) if starts.noise is None else starts.noise
+    if (noise := starts.noise) is None:
+        pixel = problem.img_scale[:, None] if problem.terms else torch.ones_like(problem.img_scale[:, None])
+        noise = given._replace(img=_filled(given.img, pixel), world=_filled(given.world, torch.zeros_like(pixel)))
     return noise._replace(img_cov=given.img_cov, world_cov=given.world_cov).bounded(problem.focal)
+
+
+def _filled(sigmas: Tensor, default: Tensor) -> Tensor:
+    """Replace NaN in sigmas (B, N) by the mean of the problem's other sigmas, or by ``default`` (B, 1)."""
+    known = ~sigmas.isnan()
+    count = known.sum(-1, keepdim=True)
+    mean = torch.where(known, sigmas, 0.0).sum(-1, keepdim=True) / count.clamp(min=1)
+    return torch.where(known, sigmas, torch.where(count > 0, mean, default))
