@@ -100,7 +100,6 @@ def test_other_columns_pass_through_and_rows_keep_their_order(draw):
 BAD = {
     "a missing list": ("world_points", None, "malformed"),
     "an empty list": ("img_points", [], "malformed"),
-    "too few pixels": ("img_points", [1.0] * 17, "malformed"),
     "too many points": ("world_points", [1.0] * 30, "malformed"),
     "part of a point": ("world_points", [1.0] * 28, "malformed"),
     "two pairs": ("world_points", [1.0] * 6, "malformed"),
@@ -166,16 +165,11 @@ def test_a_worker_gets_it_pickled(draw):
         assert pickle.loads(pickle.dumps(solve))(table) == solve(table)
 
 
-def test_no_call_of_the_solver_is_large(draw, monkeypatch):
+def test_no_call_of_the_solver_is_large(draw):
     _, table = draw(batch=50)
     solve = Solve("epnp-lm")
-    expected, called, forward = solve(table), [], solve.solver.forward
-
-    def counting(**inputs):
-        called.append(inputs["world_points"].shape[:2].numel())
-        return forward(**inputs)
-
-    monkeypatch.setattr(solve.solver, "forward", counting)
+    expected, called = solve(table), []
+    solve.solver.register_forward_hook(lambda _, args, result: called.append(result.weights.numel()))
     solve.pairs_at_once = 100
     np.testing.assert_allclose(numbers(solve(table), "rotation"), numbers(expected, "rotation"), atol=1e-5)
     assert sum(called) == 450
@@ -252,12 +246,10 @@ def test_weights_noise_and_a_shared_camera_in_arrays(make_problems, tmp_path):
     weights = (torch.arange(9) < 7).float().repeat(5, 1)
     of_all = {"img_sigma": np.array(1.0), "intrinsics": p.intrinsics[0].numpy()}
     np.savez(tmp_path / "x.npz", **arrays(p) | {"weights": weights.numpy()} | of_all)
-    solver = create_solver("pnpnet-set")
-    solve_shards(Solve(solver), [tmp_path / "x.npz"], tmp_path / "out", name="pnpnet-set")
-    with torch.no_grad():
-        expected = solver(*p[:3], weights=weights, img_sigma=1.0)
-    found = parquet.read_table(tmp_path / "out" / "x.parquet")
-    np.testing.assert_allclose(found["rotation"].to_pylist(), expected.rotation.flatten(1), atol=1e-5)
+    solve = Solve("pnpnet-set")
+    solve_shards(solve, [tmp_path / "x.npz"], tmp_path / "out", name="pnpnet-set")
+    expected = solve(table_of(p, weights=weights, img_sigma=np.ones((5, 1))))
+    assert parquet.read_table(tmp_path / "out" / "x.parquet") == expected
 
 
 def test_sources_that_are_no_shards(shards, tmp_path):
@@ -287,9 +279,6 @@ def test_the_command(shards, tmp_path):
     assert "3 shards had been solved before" in out
     assert "z.npz" in err
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == before
-    for wrong in (("solve", folder / "part0.npz", folder / "part1.npz"), (*command, "--plot", "x.png")):
-        code, _, err = run_main(*wrong)
-        assert (code, "--batch" in err) == (2, True)
 
 
 # `getrusage` may include the memory of the parent process.
