@@ -28,7 +28,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {"world_points": (_PAIRS, 3), "img_points"
 _SHAPES |= dict.fromkeys(("weights", "img_sigma", "world_sigma"), (_PAIRS,))
 #: Columns that :class:`Solve` reads.
 INPUTS = tuple(_SHAPES)
-#: Columns that :class:`Solve` writes.
+#: Columns that :class:`Solve` writes with every solver.
 OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
 _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
@@ -48,8 +48,9 @@ class Solve:
     all pairs. NaN means an unknown sigma.
 
     The result has the columns ``rotation`` (9), ``translation`` (3), ``weights`` (N), ``cost``, ``ok``, and ``status``
-    (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). Rows keep their order. Other columns of the
-    table, for example ``id``, are kept. Numbers are float32.
+    (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). If the solver estimates an unknown focal
+    length, the result also has the estimates ``intrinsics`` (9) and ``dist`` (4). Rows keep their order. Other columns
+    of the table, for example ``id``, are kept. Numbers are float32.
 
     A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. The status of a row is
     ``malformed`` if a list is missing or has an incorrect length, or if the solver does not accept the number of pairs.
@@ -108,12 +109,14 @@ class Solve:
             taken = {name: torch.from_numpy(x.take(rows, width)) for name, x in cells.items()}
             inputs: dict[str, Any] = {"intrinsics": self.intrinsics, **taken}
             with torch.no_grad(), suppress(ShapeError):  # raised if the solver does not accept `width` pairs
+        if getattr(self.solver, "focal", "known") == "unknown":
+            values |= {"intrinsics": values["rotation"].copy(), "dist": np.zeros((len(counts), 4), dtype=np.float32)}
                 result = self.solver(**inputs, mask=None if there.all() else torch.from_numpy(there))
                 for name, array in values.items():
                     array[rows] = getattr(result, name).numpy()
                 weights[(ends[rows, None] + np.arange(width))[there]] = result.weights.numpy()[there]
         columns = {name: table[name] for name in table.column_names if name not in INPUTS + OUTPUTS}
-        columns |= {name: list_column(values[name]) for name in ("rotation", "translation")}
+        columns |= {name: list_column(array) for name, array in values.items() if array.ndim > 1}
         columns["weights"] = pa.ListArray.from_arrays(pa.array(ends, pa.int32()), weights)
         columns |= {name: pa.array(values[name]) for name in ("cost", "ok")}
         return pa.table({**columns, "status": _STATUS_NAMES.take(pa.array(values["status"]))})

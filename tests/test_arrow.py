@@ -40,15 +40,16 @@ def numbers(table, name):
     return np.array(table[name].to_pylist())
 
 
-@pytest.mark.parametrize("name", ["epnp-lm", "p3p-ransac", "pnpnet-n9", "pnpnet-set", "poselib"])
+@pytest.mark.parametrize("name", ["epnp-lm", "p3p-ransac", "pnpnet-n9", "pnpnet-set", "poselib", "unknown focal"])
 def test_poses_are_those_of_a_call(name, draw):
     if name == "poselib":
         pytest.importorskip("poselib")
+    unknown = name.startswith("unknown")
+    solver = create_solver("pnpnet-set", focal="unknown", radial=1) if unknown else create_solver(name)
     problems, table = draw()
-    expected = create_solver(name)(*problems[:3])
-    found = Solve(name)(table)
+    expected, found = solver(*problems[:3]), Solve(solver)(table)
     assert found["ok"].to_pylist() == expected.ok.tolist()
-    for key in ("rotation", "translation", "weights", "cost"):
+    for key in ("rotation", "translation", "weights", "cost", *("intrinsics", "dist") * unknown):
         np.testing.assert_array_equal(numbers(found, key).ravel(), getattr(expected, key).numpy().ravel())
 
 

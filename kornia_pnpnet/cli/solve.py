@@ -16,6 +16,8 @@ world_sigma. A Parquet shard has columns with these names, and one problem per r
 
   pnpnet solve --batch shards/ --out poses/
 
+If the focal length is unknown, the files of poses also have the estimated intrinsics and distortion (dist).
+
 Exit code: 0 when solved, 1 when no pose explains the correspondences, 2 for bad input.
 """
 
