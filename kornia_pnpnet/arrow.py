@@ -88,7 +88,13 @@ class Solve:
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
-        """Solve a table. Missing columns raise ``ValueCheckError``, and columns without numbers ``TypeCheckError``."""
+        """Solve a table.
+
+        Missing columns and columns of equal names raise ``ValueCheckError``. Columns without numbers raise
+        ``TypeCheckError``.
+        """
+        if double := {name for name in table.column_names if table.column_names.count(name) > 1}:
+            raise ValueCheckError(f"the table has several columns {', '.join(sorted(double))}")
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"the table has no column {name}")

@@ -201,6 +201,7 @@ def test_bad_npz_files(tmp_path, monkeypatch):
         ({"img_points": np.ones((5, 2))}, "img_points must hold numbers of the shape (4, 2), got float64 of (5, 2)"),
         ({"world_points": np.ones((1, 4, 3)), "img_points": np.ones((1, 4, 2))}, "pass --batch"),
         ({"world_points": np.ones(())}, "world_points must hold numbers"),
+        ({"world_points": np.zeros((4, 3), "f4,f4")}, "world_points must hold numbers"),
         ({"world_points": np.array([{}], dtype=object)}, "not an NPZ file of numbers"),
         ({"world_points": np.ones((0, 3)), "img_points": np.ones((0, 2))}, "at least 3 correspondences, got 0"),
         ({"img_points": np.array([[0, 0], [1, 1], [0, math.nan], [2, 2]])}, "img_points[2] must be finite"),

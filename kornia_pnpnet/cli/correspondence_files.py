@@ -95,10 +95,7 @@ def _read_npz(path: Path) -> ImageCorrespondences:
         raise InputError(path, f"world_points of {arrays['world_points'].shape} are many problems: pass --batch")
     count = len(arrays["world_points"]) if arrays["world_points"].ndim else 0
     arrays.setdefault("weights", np.ones(count, np.float32))
-    # Float32 arrays stay in float32, so that the solver detects points that need more digits than float32 has.
-    dtype = np.float32 if np.result_type(np.float32, *arrays.values()) == np.float32 else np.float64
     shapes = {"world_points": (count, 3), "img_points": (count, 2), "weights": (count,), "intrinsics": (3, 3)}
-    tensors = {}
     for name, array in arrays.items():
         if array.dtype.kind not in "fiub" or array.shape != shapes[name]:
             got = f"{array.dtype} of {array.shape}"
@@ -107,7 +104,9 @@ def _read_npz(path: Path) -> ImageCorrespondences:
         if bad.any():
             wanted = "finite and at least 0" if name == "weights" else "finite"
             raise InputError(path, f"{name}[{int(np.nonzero(bad)[0][0])}] must be {wanted}")
-        tensors[name] = torch.tensor(array.astype(dtype))
+    # Float32 arrays stay in float32, so that the solver detects points that need more digits than float32 has.
+    dtype = np.float32 if np.result_type(np.float32, *arrays.values()) == np.float32 else np.float64
+    tensors = {name: torch.tensor(array.astype(dtype)) for name, array in arrays.items()}
     if "intrinsics" in tensors:
         tensors["intrinsics"] = _pinhole(tensors["intrinsics"], path)
     return ImageCorrespondences(**tensors)

@@ -86,6 +86,8 @@ def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
     try:
         model, *numbers = camera.replace(",", " ").split()
         width, height, *parameters = map(float, numbers)
+        if not np.isfinite([width, height, *parameters]).all():
+            raise ValueError("a number is not finite")
         lens = pycolmap.Camera(model=model.upper(), width=int(width), height=int(height), params=parameters)
         if not lens.verify_params():
             raise ValueError(f"{lens.model_name} has the parameters {lens.params_info}")
