@@ -254,6 +254,12 @@ def test_the_pages_are_rendered_from_their_files():
         assert text == path.read_text(encoding="utf-8")
 
 
+def test_a_file_that_another_step_writes_is_refused(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["make.py", "measure", "--only", "distribution"])
+    with pytest.raises(SystemExit, match="2"):
+        pytest.importorskip("make").main()
+
+
 def test_no_results_file_is_older_than_one_change_of_behaviour():
     render = pytest.importorskip("render")
     folders = render.HERE, render.REPOSITORY / "benchmarks", render.REPOSITORY / "docs" / "examples"

@@ -36,7 +36,8 @@ from measure import HERE, OTHERS, RESULTS, compare, measure, ship
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("measure", "compare", "ship", "render"))
-    parser.add_argument("--only", nargs="+", default=(), choices=(*RESULTS, *OTHERS), help="for measure: these files")
+    files = [name for name in (*RESULTS, *OTHERS) if name != "distribution"]  # `compare` writes this file
+    parser.add_argument("--only", nargs="+", default=(), choices=files, help="for measure: these files")
     scenes = HERE.parents[2] / "shared" / "data"
     parser.add_argument("--scenes", type=Path, default=scenes, help="folder of the scenes (default: %(default)s)")
     parser.add_argument("--synthetic-count", type=int, default=5000, help="problems of a synthetic set")
