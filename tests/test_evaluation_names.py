@@ -170,6 +170,10 @@ def test_weights_are_inverse_variances_by_the_jacobian(make_problems):
     problems = problems._replace(intrinsics=camera.expand(3, 3, 3))
     problems = problems._replace(img_points=problems.img_points + reprojection_errors(problems))
     weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(problems).weights
+    given = problems._replace(img_sigma=weights.new_tensor([2, 2, torch.nan]), world_sigma=0.3 * weights.new_ones(3, 9))
+    assert_same(KnownInliersAndNoise(img_sigma=2.0).solve_with_truth(given).weights, weights)  # NaN: unknown
+    exact = problems._replace(img_sigma=weights.new_zeros(3), world_sigma=weights.new_zeros(3))
+    assert KnownInliersAndNoise().solve_with_truth(exact).ok.all()
 
     def pixels(world_points):
         return reprojection_errors(problems._replace(world_points=world_points))

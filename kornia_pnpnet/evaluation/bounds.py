@@ -8,8 +8,9 @@ import torch
 from kornia.core.check import KORNIA_CHECK
 from torch import Tensor
 
-from kornia_pnpnet.core.checks import check_numbers
+from kornia_pnpnet.core.checks import check_numbers, expand_sigma
 from kornia_pnpnet.core.configured import Configured
+from kornia_pnpnet.problem import LEAST_NOISE
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.result import PnPResult, Problems
 from kornia_pnpnet.solver import PnPNet
@@ -48,8 +49,9 @@ class KnownInliersAndNoise(Configured):
     replace the sigmas and whiten the residuals. The result is then the maximum likelihood estimate.
 
     Args:
-        img_sigma: standard deviation of a pixel coordinate. The default is the value of the protocol's synthetic data.
-        world_sigma: standard deviation of a world coordinate. The default is also the protocol's value.
+        img_sigma: standard deviation of a pixel coordinate, for pairs whose problem does not give ``img_sigma``. The
+            default is the value of the protocol's synthetic data.
+        world_sigma: the same for a world coordinate. The default is also the protocol's value.
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both standard deviations are 0.
@@ -62,14 +64,16 @@ class KnownInliersAndNoise(Configured):
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """See :meth:`KnownInliers.solve_with_truth`."""
+        given = {name: expand_sigma(name, getattr(problems, name), problems.world_points) for name in self.config}
+        sigmas = {name: torch.where(x.isnan(), self.config[name], x) for name, x in given.items()}
         if problems.img_cov is None and problems.world_cov is None:
-            return _least_squares(problems, self._inverse_variances(problems))
+            return _least_squares(problems, self._inverse_variances(problems, **sigmas))
         noise = {"img_cov": problems.img_cov, "world_cov": problems.world_cov}
-        noise |= {name: sigma for name, sigma in self.config.items() if noise[name.replace("sigma", "cov")] is None}
+        noise |= {name: sigma for name, sigma in sigmas.items() if noise[name.replace("sigma", "cov")] is None}
         return _least_squares(problems, problems.inliers.to(problems.world_points.dtype), **noise)
 
     @torch.no_grad()  # with gradients, a NaN point would give its camera a NaN gradient
-    def _inverse_variances(self, problems: Problems) -> Tensor:
+    def _inverse_variances(self, problems: Problems, img_sigma: Tensor, world_sigma: Tensor) -> Tensor:
         """The weight of each pair in 1/px², (B, N). Outliers have the weight 0."""
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
@@ -77,5 +81,6 @@ class KnownInliersAndNoise(Configured):
         focal = problems.pair_intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
         # J_x = (f / z) [1, 0, -p; 0, 1, -q] R with p = x / z and q = y / z. The rotation cancels in the trace.
         trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
-        variance = self.config["img_sigma"] ** 2 + self.config["world_sigma"] ** 2 * trace / 2.0
+        img_sigma = img_sigma.maximum(LEAST_NOISE * focal.abs().amax(-1))
+        variance = img_sigma.square() + world_sigma.square() * trace / 2.0
         return torch.where(problems.inliers, variance.reciprocal(), 0.0)
