@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_form
 from kornia_pnpnet.core.extras import needs
+from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.registry import create_solver
 from kornia_pnpnet.result import Status
 
@@ -108,15 +109,16 @@ class Solve:
             "ok": np.zeros(len(counts), dtype=bool),
             "status": np.full(len(counts), len(_STATUS_NAMES) - 1, dtype=np.int8),
         }
+        if getattr(self.solver, "focal", "known") == "unknown":
+            values |= {"intrinsics": values["rotation"].copy(), "dist": np.zeros((len(counts), 4), dtype=np.float32)}
         ends = np.append(0, counts.cumsum())
         weights = np.zeros(ends[-1], dtype=np.float32)
-        for rows, width in _groups(counts, fits, self.pairs_at_once):
+        pads = not trait(getattr(self.solver, "init", None), "fixed_pairs")
+        for rows, width in _groups(counts, fits, self.pairs_at_once, pads=pads):
             there = np.arange(width) < counts[rows, None]  # (R, width), false for padding
             taken = {name: torch.from_numpy(x.take(rows, width)) for name, x in cells.items()}
             inputs: dict[str, Any] = {"intrinsics": self.intrinsics, **taken}
             with torch.no_grad(), suppress(ShapeError):  # raised if the solver does not accept `width` pairs
-        if getattr(self.solver, "focal", "known") == "unknown":
-            values |= {"intrinsics": values["rotation"].copy(), "dist": np.zeros((len(counts), 4), dtype=np.float32)}
                 result = self.solver(**inputs, mask=None if there.all() else torch.from_numpy(there))
                 for name, array in values.items():
                     array[rows] = getattr(result, name).numpy()
@@ -167,13 +169,14 @@ class _Cells:
         return self.values[self.starts[rows, None] + within].reshape(len(rows), *shape)
 
 
-def _groups(counts: np.ndarray, fits: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, int]]:
+def _groups(counts: np.ndarray, fits: np.ndarray, most: int, *, pads: bool) -> Iterator[tuple[np.ndarray, int]]:
     """For each call of the solver, yield the rows and the number of pairs to which the rows are padded.
 
-    Problems of 16 or more pairs are padded by less than a quarter, to the next size in 16, 20, 24, 28, 32, 40, 48, ...
+    If ``pads`` is true, problems of 16 or more pairs are padded by less than a quarter, to the next size in 16, 20, 24,
+    28, 32, 40, 48, ... Other problems are not padded.
     """
     step = 2 ** (np.log2(counts.clip(_PADDED_FROM)).astype(int) - 2)
-    widths = np.where(counts < _PADDED_FROM, counts, -(-counts // step) * step)
+    widths = np.where((counts < _PADDED_FROM) | (not pads), counts, -(-counts // step) * step)
     for width in np.unique(widths[fits]):
         rows = np.flatnonzero(fits & (widths == width))
         for part in np.array_split(rows, -(-len(rows) * width // most)):

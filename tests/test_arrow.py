@@ -12,7 +12,7 @@ from helpers import arrays, run_main
 from helpers import table as table_of
 from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 
-from kornia_pnpnet import create_solver
+from kornia_pnpnet import MLPInit, PnPNet, create_solver
 from kornia_pnpnet.cli.correspondence_files import InputError
 
 pa = pytest.importorskip("pyarrow")
@@ -130,9 +130,9 @@ def test_a_bad_row_is_not_ok_and_changes_no_other(kind, draw):
 
 
 def test_rows_for_another_network_are_malformed_and_few_rows_are_a_table(draw):
-    table = pa.concat_tables([draw(8, 2)[1], draw(9, 3)[1]])
-    solve = Solve("pnpnet-n9")
-    assert solve(table)["status"].to_pylist() == ["malformed"] * 2 + ["solved"] * 3
+    for n in (9, 18):  # tables of 18 pairs would be padded to 20 pairs for solvers of any number of pairs
+        table, solve = pa.concat_tables([draw(n - 1, 2)[1], draw(n, 3)[1]]), Solve(PnPNet(MLPInit(n)).eval())
+        assert [x == "malformed" for x in solve(table)["status"].to_pylist()] == [True] * 2 + [False] * 3
     assert [len(solve(table.slice(2, rows))) for rows in (0, 1)] == [0, 1]
 
 
