@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from kornia.core.exceptions import ValueCheckError
 from omegaconf import DictConfig, OmegaConf
 
-from kornia_pnpnet.core.files import write_json
+from kornia_pnpnet.core.files import digest, write_json
 from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training import TrainingError, fit
@@ -52,7 +52,7 @@ def main(config: DictConfig) -> float | None:
     fabric.launch()
     torch.manual_seed(config.seed)
     model = instantiate(config.model.solver)
-    origin = None
+    origin = start = None
     if config.weights is not None:
         try:
             start_from(model, PnPNet.from_pretrained(config.weights))
@@ -60,6 +60,7 @@ def main(config: DictConfig) -> float | None:
         except (FileNotFoundError, RuntimeError, ValueError, ValueCheckError) as error:
             reason = " ".join(str(error).split())[:300]
             sys.exit(f"Cannot start n = {config.model.n} from weights={config.weights}: {reason}")
+        start = digest(*model.state_dict().values())  # files of weights may have another path on another machine
     if config.compile:
         model.compile()
     validation = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
@@ -72,6 +73,7 @@ def main(config: DictConfig) -> float | None:
         sizes = sum(p.numel() for p in model.parameters() if p.requires_grad), fabric.world_size
         log.info("n = %s, m = %s, %s parameters, %s processes", config.model.n, config.model.m, *sizes)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
+    identity = {"data": resolved["data"]["train"], "loss": resolved["loss"], "model_config": resolved["model"]}
     settings = instantiate(config.train, _convert_="all")
     try:
         report = fit(
@@ -82,7 +84,7 @@ def main(config: DictConfig) -> float | None:
             settings,
             folder,
             fabric=fabric,
-            identity={"data": resolved["data"]["train"], "loss": resolved["loss"], "model_config": resolved["model"]},
+            identity={**identity, "weights": start},
             data_workers=config.data_workers,
             resume=config.resume,
             progress=config.progress,

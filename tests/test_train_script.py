@@ -103,6 +103,11 @@ def test_run_starts_from_weights(tmp_path, train):
     assert_same(PnPNet.from_pretrained(tmp_path / "run" / "weights").state_dict(), weights.state_dict())
     lineage = load_run(tmp_path / "run" / "results.json").lineage()
     assert [entry.run.update for entry in lineage] == [200_000, 5000, 2000, 2]
+    again = f"hydra.run.dir={tmp_path / 'run'}", *options, *learn_nothing, "resume=true"
+    train(*again, f"weights={tmp_path / 'run' / 'weights'}")
+    with pytest.raises(SystemExit, match=r"^1$"):
+        train(*again, "weights=null")
+    assert "of another run: weights was" in (tmp_path / "run" / "train.log").read_text()
     train(f"hydra.run.dir={tmp_path / 'again'}", *options, f"weights={tmp_path / 'run' / 'weights'}", "train.updates=3")
     collect_weights([tmp_path / "run", tmp_path / "again"], tmp_path / "mine")
     history = read_csv(tmp_path / "mine" / "history.csv", ["update"]).values()
@@ -117,9 +122,12 @@ def test_run_starts_from_weights(tmp_path, train):
     assert deeper.refine.step().tolist() == pytest.approx([1.0] * (weights.refine.m + 1))
     assert_same(list(deeper.init.parameters()), list(weights.init.parameters()))
     assert PnPNet.from_pretrained(tmp_path / "mine").config() == weights.config()
-    for wrong in ("model.n=6", "weights=nowhere"):
-        with pytest.raises(SystemExit, match="Cannot start"):
+    (tmp_path / "mine" / "results.json").write_text('{"overrides": [1]}')
+    damaged = f"weights={tmp_path / 'mine'}", r"is not a results file of a run: overrides\[0\] is 1"
+    for wrong, why in (("model.n=6", ""), ("weights=nowhere", ""), damaged):
+        with pytest.raises(SystemExit, match=f"Cannot start.*{why}"):
             train(f"hydra.run.dir={tmp_path}/wrong", *options, wrong)
+    assert not (tmp_path / "wrong" / "last.ckpt").exists()
 
 
 MINE = """
@@ -147,14 +155,6 @@ def test_data_of_ones_own_and_any_validation_sets(tmp_path, monkeypatch, train):
     assert "board/rate" in (tmp_path / "sweep" / "summary.csv").read_text()
     with pytest.raises(SystemExit, match=r"data\.validation is empty"):
         train(*away, f"hydra.run.dir={tmp_path}/none")
-
-
-def test_damaged_results_beside_weights_are_an_error_before_the_training(tmp_path, train):
-    PnPNet.from_pretrained("pnpnet-n9").save_pretrained(tmp_path / "weights")
-    (tmp_path / "weights" / "results.json").write_text('{"overrides": [1]}')
-    with pytest.raises(SystemExit, match=r"is not a results file of a run: overrides\[0\] is 1"):
-        train(f"weights={tmp_path / 'weights'}", f"hydra.run.dir={tmp_path}/run", "model.m=10")
-    assert not (tmp_path / "run" / "last.ckpt").exists()
 
 
 @pytest.mark.slow
