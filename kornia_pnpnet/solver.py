@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.arguments import checked_inputs, given_cameras, in_parts, restore_leading
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
-from kornia_pnpnet.core.performance import Runner, in_full_precision, in_turn, needs_graph, sees_values
+from kornia_pnpnet.core.performance import Runner, compiling, in_full_precision, in_turn, needs_graph, sees_values
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.core.watch import GradientWatch
 from kornia_pnpnet.frame import Frame, Normalize
@@ -264,7 +264,7 @@ class PnPNet(PretrainedMixin):
         check_whole(0, alternatives=alternatives)
         rig = self._is_rig(inputs, dist, fisheye, alternatives)
         call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always", alternatives)
-        compiled = self._run.compiled or self._whole.compiled
+        compiled = (self._run.compiled or self._whole.compiled) and not compiling()
         plain = not (compiled or needs_graph((*iter_tensors(inputs), *self.parameters())))
         inference = torch.inference_mode() if plain else nullcontext()
         with in_full_precision(inputs.world_points.device.type), inference:

@@ -39,7 +39,6 @@ def problems(count, n=9, dtype=torch.float64):
 
 
 def assert_compiled_is_eager(solver, compiled, batch, rtol=1e-6, atol=1e-6, gradients=False):
-    """Two solvers have the same results and, on request, the same gradients."""
 
     def solve(net):
         inputs = [x.clone().requires_grad_(gradients) for x in batch[:3]]
@@ -119,9 +118,8 @@ def test_an_older_pytorch_runs_it_as_it_is(monkeypatch):
 
 
 def test_too_little_memory_is_no_failure_of_the_compiler(monkeypatch):
-    full = Mock(side_effect=torch.cuda.OutOfMemoryError("too large"))
+    full, run = Mock(side_effect=torch.cuda.OutOfMemoryError("too large")), Runner(True)
     monkeypatch.setattr(torch, "compile", lambda function, **options: full)
-    run = Runner(True)
     with pytest.raises(torch.cuda.OutOfMemoryError):
         run(torch.neg, torch.ones(3))
     assert not run.failed
@@ -135,7 +133,6 @@ def test_errors_of_the_caller_are_the_callers(backend):
         solver(world, img[:, :8], intrinsics)
     with pytest.raises(Exception, match=r"built for n = 9"):
         solver(world[:, :8], img[:, :8], intrinsics)
-
     run, x = Runner(True), torch.rand(2, 3, 4)
     with pytest.raises(IndexError):
         run(in_order, x[0, 0])
@@ -151,8 +148,8 @@ class Scaled(nn.Module):
         self.scale = nn.Parameter(torch.ones(1))
         self.run = Runner(True)
 
-    def forward(self, x):
-        return self.run(self.scaled, x)
+    def forward(self, x, part=None):
+        return self.run((part or self).scaled, x)
 
     def scaled(self, x):
         return self.scale * x
@@ -165,7 +162,8 @@ def test_copies_use_their_own_weights(backend):
         other.load_state_dict({"scale": torch.full((1,), 0.5)})
         assert torch.equal(other(x), 0.5 * x)
         assert torch.equal(module(x), x)
-    assert backend.frame_count == 3
+        assert torch.equal(module(x, other), 0.5 * x)  # as if it replaced a part of the module
+    assert backend.frame_count == 5
 
 
 @pytest.mark.parametrize("name", ["pnpnet-n9", "epnp-lm", "reppnp-lm"])
@@ -220,7 +218,6 @@ def test_inductor_computes_the_same_with_more_pairs_than_problems():
 
 
 def several(values, *shape):
-    """Whole numbers, so that many are equal."""
     return torch.randint(values, shape, generator=torch.Generator().manual_seed(1)).to(torch.float32) - values // 2
 
 

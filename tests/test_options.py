@@ -35,7 +35,6 @@ KINDS |= {"Sequence[int]": st.lists(COUNTS, max_size=3), "None": st.none()}
 
 @st.composite
 def options_of(draw, constructor):
-    """None, one or two of the constructor's options; the others keep their defaults."""
     types = {x.name: x.annotation.split(" | ") for x in inspect.signature(constructor).parameters.values()}
     kinds = {name: [KINDS[x] for x in parts if x in KINDS] for name, parts in types.items() if name != "device"}
     names = draw(st.lists(st.sampled_from(sorted(x for x in kinds if kinds[x])), max_size=2, unique=True))
@@ -43,7 +42,6 @@ def options_of(draw, constructor):
 
 
 def solves(part, values):
-    """A solver with this part has finite results."""
     key = {RobustWeightedLM: "refine", Normalize: "normalize"}.get(type(part), "init")
     solver = part if isinstance(part, PeerSolver | PnPNet) else PnPNet(**{"init": EPnP(), key: part})
     n = values.get("n", 9)
@@ -51,13 +49,11 @@ def solves(part, values):
 
 
 def costs(loss, values):
-    """The loss of a result is finite."""
     result, guess = create_solver("pnpnet-set").with_starts(*PROBLEMS[:3])
     finite(loss(result, PROBLEMS, 1.0, guess) if isinstance(loss, SetLoss) else loss(result, PROBLEMS))
 
 
 def is_sound(problems, values):
-    """The drawn problems have finite points and proper rotations."""
     finite(problems._replace(img_sigma=None, world_sigma=None))
     are_rotations(problems.pose.rotation)
     assert problems.inliers.shape == problems.world_points.shape[:2]
@@ -89,7 +85,6 @@ def mixture(**values):
 
 
 def factors_are_sound(settings, values):
-    """Learning rates and ramp stay in their bounds."""
     for update in range(13):
         assert 0 <= settings.lr_factor(update) < math.inf
         assert 0 <= settings.ramp_factor(update) <= 1

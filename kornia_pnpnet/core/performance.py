@@ -282,9 +282,9 @@ class Runner:
             warnings.warn(f"Not compiled, running uncompiled. {reason}", RuntimeWarning, stacklevel=3)
             compiled = False
         self.compiled, self.mode = compiled, mode
-        self.failed: set[str] = set()  # names of functions whose compilation failed
-        # Keys of `_functions`: name of the function, and whether problems have at least `_MANY_PAIRS` pairs.
-        self._functions: dict[tuple[str, bool], Callable[..., Any]] = {}
+        self.failed: set[Callable[..., Any]] = set()  # functions whose compilation failed
+        # Keys of `_functions`: the function, and whether problems have at least `_MANY_PAIRS` pairs.
+        self._functions: dict[tuple[Callable[..., Any], bool], Callable[..., Any]] = {}
         self._seen: set[tuple[Any, ...]] = set()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -293,32 +293,32 @@ class Runner:
 
     def __call__(self, function: Callable[..., _T], *args: Any) -> _T:
         """Call a function."""
-        if not self.compiled or compiling() or function.__qualname__ in self.failed:
+        if not self.compiled or compiling() or function in self.failed:
             return function(*args)
         # Compiled code expects one memory layout, but the layout of uncompiled results depends on the batch size.
         args = map_tensors(_last, args)
         tensors = list(iter_tensors(args))
-        name, first = function.__qualname__, tensors[0]
+        first = tensors[0]
         many = first.ndim > 1 and first.shape[1] >= _MANY_PAIRS
-        kind = name, first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
+        kind = function, first.shape, first.dtype, len(tensors), torch.is_grad_enabled()
         if kind in self._seen:
             with suppress(Exception):  # a warnings filter may turn a warning into an error: run again below
-                return cast(_T, self._functions[name, many](*args))
+                return cast(_T, self._functions[function, many](*args))
         try:
-            if (name, many) not in self._functions:
-                self._functions[name, many] = self._compile(function, many)
+            if (function, many) not in self._functions:
+                self._functions[function, many] = self._compile(function, many)
             for tensor in tensors:
                 if tensor.ndim and tensor.shape[0] > 1:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
             with warnings.catch_warnings(action="ignore"):  # the compiler warns about its own code
-                result: _T = self._functions[name, many](*args)
+                result: _T = self._functions[function, many](*args)
             self._seen.add(kind)
             return result
         except torch.cuda.OutOfMemoryError:
             raise
         except Exception as error:  # the compiler raises many types of errors
             result = function(*args)  # an invalid call raises its own error here
-            self.failed.add(name)
+            self.failed.add(function)
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"Not compiled, running uncompiled. {reason[:300]}", RuntimeWarning, stacklevel=3)
             return result
