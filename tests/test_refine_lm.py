@@ -8,7 +8,7 @@ import torch
 from helpers import assert_same, reprojection_errors, verified_derivative
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, pose_errors
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, pose_errors
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.problem import Problem, State
@@ -169,6 +169,8 @@ def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, make_p
     for unrolled, implicit in zip(*(x[:3] for x in gradients), strict=True):
         torch.testing.assert_close(implicit, unrolled, rtol=1e-4, atol=1e-5 * unrolled.abs().max().item())
     assert [x.any().item() for x in gradients[1]] == [True] * 4 + [False] * 4
+    judged = PnPNet(SetInit(samples=0).double(), RobustWeightedLM(0, backward=backward), gradient="always")(*leaves[:3])
+    assert torch.autograd.grad(judged.rotation.sum(), leaves[1])[0].any()  # the gradient of the start
 
 
 def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_problems, perturb):

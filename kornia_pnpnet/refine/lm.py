@@ -300,7 +300,8 @@ class RobustWeightedLM(Configured):
         explored = min(self.explored, m) if plan.starts > 1 else 0
         switch = max(self.m - self.by_residual, explored) if self.by_residual else len(each)
         guided, now = plan.problem._replace(weights=plan.guided), Progress.of(plan.state)
-        with torch.set_grad_enabled(torch.is_grad_enabled() and self.backward == "unroll"):
+        implicit = self.backward == "implicit" and len(each) > 0  # without iterations, the starts have the gradient
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not implicit):
             if plan.starts > 1:
                 several = repeat_problems(guided, plan.starts)
                 for one in each[:explored]:
@@ -313,8 +314,8 @@ class RobustWeightedLM(Configured):
                 plan, now = run(self.shown, plan, now)
             for step, damping, _ in each[switch:]:
                 now = run(self.by_residuals, plan, now, plan.votes.known, step, damping)
-        if self.backward == "implicit" and m and torch.is_grad_enabled():
-            now = now._replace(state=self._with_gradient(plan, now, plan.hyperparameters[m - 1][2]))
+        if implicit and torch.is_grad_enabled():
+            now = now._replace(state=self._with_gradient(plan, now, each[-1][2]))
         return plan, now
 
     def by_residuals(self, plan: Plan, now: Progress, known: Tensor, step: Tensor, damping: Tensor) -> Progress:
