@@ -50,6 +50,7 @@ def test_effort_is_adaptive_in_inference_and_fixed_in_training_and_in_graphs():
     mapped = torch.func.vmap(lambda *x: solvers[1](*x).translation)(*inputs)
     assert torch.allclose(mapped, solvers[0](*inputs).translation, rtol=1e-4, atol=1e-4)
 
+    assert PnPNet(k.SetInit(starts=1, samples=0)).eval()(*inputs).ok.all()
 
 def test_a_network_may_see_the_confidence(make_problems, generator):
     p = make_problems(12)

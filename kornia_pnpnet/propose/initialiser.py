@@ -24,7 +24,7 @@ class Initialiser(Configured):
         takes_given: whether ``forward(problem, given)`` accepts a given pose.
         takes_rigs: whether the initialiser solves rigs.
         finds_focal: whether the initialiser estimates an unknown focal length.
-        estimates_noise: whether the result contains several poses and the noise. Such an initialiser accepts
+        estimates_noise: whether the result contains the noise. Such an initialiser accepts
             ``forward(problem, search_follows=True)``.
         weighs_unusual: whether the weights of unusual pairs (``Problem.usual``) are final. If not, `propose` sets them.
     """

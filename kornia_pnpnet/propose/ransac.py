@@ -214,7 +214,7 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
 
     Args:
         problem: normalised problems of a centred and scaled world.
-        starts: several poses per problem, and the noise of the pairs. Weights are probabilities that pairs are inliers.
+        starts: poses of each problem, and the noise of the pairs. Weights are probabilities that pairs are inliers.
         keep_others: whether to keep the other poses of the starts. With few pairs, the best pose can be incorrect.
 
     Returns:
@@ -223,12 +223,12 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
         thresholds, for the comparison with the refined pose (see `reconsider`).
 
     Raises:
-        ValueCheckError: when the starts have only one pose, or no noise.
+        ValueCheckError: when the starts have no noise.
     """
     constant = map_tensors(torch.Tensor.detach, starts)
     known, noise = problem.noise, constant.noise
-    if noise is None or starts.others is None:
-        raise ValueCheckError('effort="adaptive" needs an initialiser of several poses and the noise, like SetInit.')
+    if noise is None:
+        raise ValueCheckError('effort="adaptive" needs an initialiser that estimates the noise, like SetInit.')
     problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
     depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)
