@@ -451,8 +451,11 @@ class PnPNet(PretrainedMixin):
     @torch.no_grad()
     def _with_alternatives(self, attempt: _Attempt, most: int) -> PnPResult:
         """Add at most ``most`` alternative poses to the result."""
-        frame, result, problem = attempt.frame, attempt.result, attempt.problem.seen_with(attempt.refined.state.zoom)
-        found = find_alternatives(self.refine, problem, attempt.starts, frame.apply(result.pose), frame.valid, most)
+        problem, frame, starts, refined, result = attempt
+        zoom = refined.state.zoom
+        starts = starts._replace(noise=problem._replace(noise=starts.noise).seen_with(zoom).noise)
+        pose, problem = frame.apply(result.pose), problem.seen_with(zoom)
+        found = find_alternatives(self.refine, problem, starts, pose, frame.valid, most)
         poses = frame.undo(Pose(found.rotation, found.translation))
         translation = torch.where(found.valid[..., None], poses.translation, 0.0)
         return result._replace(alternatives=found._replace(translation=translation))

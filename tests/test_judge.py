@@ -19,13 +19,11 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 
 def drawn(pairs, outliers, sigma):
-    """Problems of cameras with the focal length 1000."""
     options = {"field_of_view": (90.0, 90.0), "outlier_share": outliers / pairs, "img_sigma": sigma}
     return CameraProblems(n=pairs, batch_size=50, seed=0, dtype=torch.float64, **options).batch(0)
 
 
 def scene(pairs, outliers, sigma):
-    """The problems with the principal point 0, and their poses."""
     p = drawn(pairs, outliers, sigma)
     return Problem.of(p.world_points, p.img_points - p.intrinsics[:, None, :2, 2], 1000.0), p.pose
 
@@ -103,7 +101,6 @@ def test_probability_tells_sound_problems_from_random_pixels(effort, sigmas):
 
 
 def test_probability_is_observed_as_often():
-    """Problems with many outliers, by the law's own definition of far off."""
     p = SyntheticProblems(n=12, batch_size=1500, seed=5, outliers=OutlierMix(max_ratio=0.8)).batch(0)
     result = create_solver("pnpnet-set")(*p[:3])
     depth = transform_points(p.pose.matrix, p.world_points)[..., 2].median(1).values
@@ -159,7 +156,6 @@ def boards(generator, batch=60, tilt=40.0, sigma=0.0, dtype=torch.float64):
 
 
 def answers(result):
-    """The pose and the alternatives of a result, and which of them there are."""
     found = result.alternatives
     others = [Pose(*x) for x in zip(found.rotation.unbind(1), found.translation.unbind(1), strict=True)]
     return [result.pose, *others], [torch.ones_like(result.ok), *found.valid.unbind(1)]
@@ -201,7 +197,8 @@ def test_a_pose_is_not_believed_beside_its_mirror_image(generator):
 def test_a_board_seen_from_the_front(generator):
     """The mirror image is often no minimum; the tilt is then as uncertain as the image says."""
     *given, pose = boards(generator, batch=200, tilt=8.0, sigma=1.0)
-    result = create_solver("pnpnet-set")(*given, img_sigma=1.0, world_sigma=0.0, alternatives=1)
+    options = {"img_sigma": 1.0, "world_sigma": 0.0, "alternatives": 1}
+    result = create_solver("pnpnet-set")(*given, **options)
     poses, (_, valid) = answers(result)
     assert valid.double().mean() > 0.6
     first, other = (pose_errors(x, pose).rotation_error_deg < 8.0 for x in poses)
@@ -210,6 +207,12 @@ def test_a_board_seen_from_the_front(generator):
     seen = [(x.rotation @ given[0].mean(1)[..., None])[..., 0] + x.translation for x in (poses[1], pose)]
     angle = torch.nn.functional.cosine_similarity(*seen, dim=-1)[valid].clamp(max=1.0).acos()
     assert (angle < math.radians(0.3)).all()
+    # An unknown focal length, expected 1.5 times too long, gives the alternatives of the found one.
+    camera = given[2] * given[2].new_tensor([[1.5, 1.0, 1.0], [1.0, 1.5, 1.0], [1.0, 1.0, 1.0]])
+    found = create_solver("pnpnet-set", focal="unknown", focal_sigma=0.5)(*given[:2], camera, **options)
+    known = create_solver("pnpnet-set")(*given[:2], found.intrinsics, **options)
+    both = found.alternatives.valid & known.alternatives.valid
+    assert (found.alternatives.cost / known.alternatives.cost)[both].log().abs().median() < 1e-6
 
 
 def test_the_solutions_of_three_pairs(make_problems):
@@ -281,7 +284,6 @@ def camera(focal=800.0, centre=CENTRE):
 
 
 def observed(outliers=10, batch=()):
-    """Points, pixels with a noise of 0.5 px and outliers, and the pose."""
     generator = torch.Generator().manual_seed(40)
     pixels = torch.rand(*batch, 40, 2, generator=generator) * SIZE
     z = 4.0 + 4.0 * torch.rand(*batch, 40, 1, generator=generator)

@@ -13,6 +13,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, SetLoss, pose_errors, success
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.propose.mlp import rotation_about
 
 NOISE = {"img_sigma": 1.0, "world_sigma": 0.05}
@@ -45,6 +46,9 @@ def test_known_noise_is_used_as_it_is_and_unknown_noise_is_estimated(make_proble
     torch.testing.assert_close(noise.img[~known], net.with_starts(*p[:3])[1].noise.img[~known])
     of_pairs = torch.rand(4, 9, dtype=torch.float64) + 0.1
     torch.testing.assert_close(net.with_starts(*p[:3], world_sigma=of_pairs)[1].noise.world, of_pairs)
+    problem, given = net.normalize(*p[:3])[0], Noise(of_pairs, torch.full_like(of_pairs, torch.nan))
+    starts = net.init(problem)
+    assert_same(net.refine.begin(problem._replace(noise=given), starts).problem.noise[:2], (of_pairs, starts.noise[1]))
 
 
 def test_it_learns():
@@ -54,7 +58,6 @@ def test_it_learns():
     data = SyntheticProblems(n=9, batch_size=200, seed=1, outliers=OutlierMix(), max_angle=math.pi, known_noise=0.5)
     fresh = SyntheticProblems(n=9, batch_size=1000, seed=2, outliers=OutlierMix(), max_angle=math.pi).batch(0)
     loss, optimizer = SetLoss(), torch.optim.Adam(net.parameters(), lr=4e-3)
-
     before = rate(net(*fresh[:3], **NOISE), fresh)
     for i in range(100):
         p = data.batch(i)

@@ -477,24 +477,25 @@ def taken(tree: _T, index: Tensor) -> _T:
 
 
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
-    """Complete the noise of every pair. The initialiser gives the sigmas, and the caller gives the covariances.
+    """Complete the noise of every pair. The initialiser gives the sigmas that the problem lacks.
 
     If the initialiser gives no noise, the mean of the problem's known sigmas replaces each unknown sigma. If no sigma
     is known, points get 0, and pixels get 1 (one pixel of the caller if there are terms), as without noise. If neither
     gives noise, return ``None``.
     """
-    given = starts.noise if problem.noise is None else problem.noise
+    given, guess = problem.noise, starts.noise
     if given is None:
-        return None
-    if (noise := starts.noise) is None:
+        return None if guess is None else guess.bounded(problem.focal)
+    if guess is None:
         pixel = problem.img_scale[:, None] if problem.terms else torch.ones_like(problem.img_scale[:, None])
-        noise = given._replace(img=_filled(given.img, pixel), world=_filled(given.world, torch.zeros_like(pixel)))
+        guess = Noise(_mean_known(given.img, pixel), _mean_known(given.world, torch.zeros_like(pixel)))
+    noise = map_tensors(lambda x, y: torch.where(x.isnan(), y, x), given.sigmas, guess)
     return noise._replace(img_cov=given.img_cov, world_cov=given.world_cov).bounded(problem.focal)
 
 
-def _filled(sigmas: Tensor, default: Tensor) -> Tensor:
-    """Replace NaN in sigmas (B, N) by the mean of the problem's other sigmas, or by ``default`` (B, 1)."""
+def _mean_known(sigmas: Tensor, default: Tensor) -> Tensor:
+    """The mean (B, 1) of the known sigmas (B, N) of each problem, or ``default`` (B, 1) if no sigma is known."""
     known = ~sigmas.isnan()
     count = known.sum(-1, keepdim=True)
     mean = torch.where(known, sigmas, 0.0).sum(-1, keepdim=True) / count.clamp(min=1)
-    return torch.where(known, sigmas, torch.where(count > 0, mean, default))
+    return torch.where(count > 0, mean, default)
