@@ -298,7 +298,8 @@ class PnPNet(PretrainedMixin):
         self._is_rig(inputs, options.get("dist"), options.get("fisheye"))
         with in_full_precision(inputs.world_points.device.type):
             call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always")
-            attempt = self._attempt(self._with_camera(inputs)[0], call)
+            inputs, nominal = self._with_camera(inputs)
+            attempt = self._attempt(inputs, call, nominal=nominal)
             return restore_leading(size, (attempt.result, attempt.frame.undo_starts(attempt.starts)))
 
     def _is_rig(self, inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None, alternatives: int = 0) -> bool:

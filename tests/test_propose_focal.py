@@ -91,7 +91,7 @@ def test_the_search_helps_where_the_network_does_not_suffice():
     p = draw(12, wrong=6, noise=1.0, batch=256)
     right = {}
     for effort in ("fixed", "adaptive"):
-        result = create_solver("pnpnet-set", focal="unknown", effort=effort)(*p[:2], withheld(p))
+        result, _ = create_solver("pnpnet-set", focal="unknown", effort=effort).with_starts(*p[:2], withheld(p))
         focal, shift, turn = errors(result, p)
         right[effort] = (focal < 0.025) & (shift < 0.025) & (turn < math.radians(0.5))
         assert (result.ok & ~right[effort]).double().mean() < 0.04
