@@ -21,12 +21,10 @@ def draw(n, batch=64, *, wrong=0, spread=0.4, noise=0.0, seed=0, **options):
 
 
 def withheld(problems):
-    """The intrinsics with the focal length 1."""
     return scale_focal(problems.intrinsics, problems.intrinsics[:, 0, 0].reciprocal())
 
 
 def errors(result, problems):
-    """Relative errors of the focal length and of the position, and the rotation's error in radians."""
     focal = result.intrinsics[:, 0, 0] / problems.intrinsics[:, 0, 0] - 1.0
     distance = problems.true_cam_points[..., 2].mean(1)
     shift = (result.translation - problems.pose.translation).norm(dim=-1) / distance
@@ -101,7 +99,6 @@ def test_the_search_helps_where_the_network_does_not_suffice():
 
 
 def seen_through_a_lens(radial, *, noise=0.5, seed=0, **options):
-    """Problems, their distorted pixels and the coefficients."""
     p = draw(seed=seed, **options)
     dist = torch.tensor([-0.2, 0.03 * (radial - 1), 0.0, 0.0], dtype=torch.float64).expand(len(p.inliers), -1)
     pixels = distort_points(p.img_points, p.intrinsics, dist)
@@ -113,14 +110,16 @@ def seen_through_a_lens(radial, *, noise=0.5, seed=0, **options):
 def test_radial_distortion_is_estimated_with_the_focal_length(name, radial):
     wrong = 0 if name == "reppnp-lm" else 8
     p, pixels, dist = seen_through_a_lens(radial, n=40, batch=32, wrong=wrong, field_of_view=(40.0, 90.0))
-    without = create_solver(name, focal="unknown")(p.world_points, pixels, withheld(p))
+    seen = 1.0 + 94.0 * (torch.arange(40) == 3).expand(32, -1)  # one pair has no probability and is left out
+    pixels[:, 3] = torch.nan
+    without = create_solver(name, focal="unknown")(p.world_points, pixels, withheld(p), confidence=seen)
     assert (errors(without, p)[0] > 0.02).double().mean() > 0.5
     assert not without.dist.any()
-    result = create_solver(name, focal="unknown", radial=radial)(p.world_points, pixels, withheld(p))
+    result = create_solver(name, focal="unknown", radial=radial)(p.world_points, pixels, withheld(p), confidence=seen)
     focal, shift, turn = errors(result, p)
     assert ((focal < 0.01) & (shift < 0.01) & (turn < math.radians(0.25)) & result.ok).double().mean() > 0.9
     assert (result.dist - dist)[:, 0].abs().median() < 0.01
-    known = create_solver(name)(p.world_points, pixels, result.intrinsics, dist=result.dist)
+    known = create_solver(name)(p.world_points, pixels, result.intrinsics, dist=result.dist, confidence=seen)
     torch.testing.assert_close(known.rotation, result.rotation, rtol=0, atol=0.01)
 
 

@@ -99,7 +99,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
     inputs = _zoomed(inputs, zoom)
     if radial:
         with torch.no_grad():
-            problem, frame = normalize(*inputs[:5])
+            problem, frame = normalize(*inputs[:5], confidence=inputs.confidence)
             # `_with_distortion` uses only the prior of the distortion. The refinement also uses the prior of log f.
             known = known._replace(information=torch.zeros_like(zoom)).scaled(frame.img_scale)
             at = _with_distortion(problem._replace(free_focal=known), frame.apply(pose), radial)
