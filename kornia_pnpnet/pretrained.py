@@ -31,8 +31,8 @@ _FINGERPRINT = "sha256"
 _LARGEST_CONFIG = 2**20
 # Integers up to this value are accepted in every configuration, because tensors of these sizes take little memory.
 _SMALL = 1000
-# Options in pixels, which are sizes of no tensor.
-_LENGTHS = ("f_const", "img_scale")
+# Options that are lengths or scales, but not sizes of tensors.
+_LENGTHS = ("f_const", "img_scale", "max_error", "robustness", "world_scale")
 
 
 def shipped_weights() -> list[str]:

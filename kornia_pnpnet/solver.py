@@ -152,7 +152,8 @@ class PnPNet(PretrainedMixin):
         searches = effort != "adaptive" or trait(init, "estimates_noise")
         KORNIA_CHECK(searches, "effort='adaptive' needs an initialiser that estimates the noise.")
         self.views, self.gradient, self.effort = int(views), _checked_gradient(gradient), effort
-        self.focal, self.focal_sigma, self.radial = focal, focal_sigma, int(radial)
+        self.focal, self.radial = focal, int(radial)
+        self.focal_sigma = None if focal_sigma is None else float(focal_sigma)  # JSON has no NumPy numbers
         self.init = init
         self.refine = RobustWeightedLM(learnable=False) if refine is None else refine
         self.normalize = Normalize() if normalize is None else normalize

@@ -4,6 +4,7 @@ import os
 import re
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from helpers import assert_same, rate
@@ -49,8 +50,8 @@ def test_effort_is_adaptive_in_inference_and_fixed_in_training_and_in_graphs():
     inputs = SyntheticProblems(n=20, batch_size=3, seed=1).batch(0)[:3]
     mapped = torch.func.vmap(lambda *x: solvers[1](*x).translation)(*inputs)
     assert torch.allclose(mapped, solvers[0](*inputs).translation, rtol=1e-4, atol=1e-4)
-
     assert PnPNet(k.SetInit(starts=1, samples=0)).eval()(*inputs).ok.all()
+
 
 def test_a_network_may_see_the_confidence(make_problems, generator):
     p = make_problems(12)
@@ -234,7 +235,7 @@ def test_more_views_solve_more(make_problems):
 
 def saved_net():
     refine = RobustWeightedLM(m=2, kernel="cauchy", shared=True, update="additive", reject_worse=True)
-    solver = PnPNet(MLPInit(6, world_scale=2.0), refine, Normalize(center=False), views=3)
+    solver = PnPNet(MLPInit(6, world_scale=2000), refine, Normalize(center=False), views=3)
     with torch.no_grad():
         for parameter in solver.parameters():
             parameter.add_(0.01 * torch.randn_like(parameter))
@@ -245,8 +246,8 @@ def saved_net():
     "solver",
     [
         saved_net,
-        lambda: PnPNet(None, RobustWeightedLM(m=2, step=0.9), gradient="always"),
-        lambda: create_solver("epnp-lm", m=2, focal="unknown", focal_sigma=0.1, radial=1),
+        lambda: PnPNet(None, RobustWeightedLM(m=2, step=np.float32(0.9)), gradient="always"),
+        lambda: create_solver("epnp-lm", m=2, focal="unknown", focal_sigma=np.float32(0.1), radial=1),
         lambda: create_solver("pnpnet-set", effort="fixed", views=2),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 from torch import nn
@@ -21,8 +21,9 @@ class Configured(nn.Module):
         self.config: dict[str, Any] = {}
         for name, value in arguments.items():
             if name not in ("self", "__class__") and not isinstance(value, nn.Module):
-                is_numpys = isinstance(value, Integral) and not isinstance(value, bool)  # JSON has no NumPy integers
-                self.config[name] = int(value) if is_numpys else value
+                if isinstance(value, Real) and not isinstance(value, bool):  # JSON has no NumPy numbers
+                    value = int(value) if isinstance(value, Integral) else float(value)
+                self.config[name] = value
 
     def extra_repr(self) -> str:
         """Show the arguments of the constructor."""
