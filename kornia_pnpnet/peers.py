@@ -47,7 +47,8 @@ class PeerSolver(nn.Module):
     A subclass implements :meth:`solve_one`, and is a dataclass whose fields are the arguments of the constructor. The
     library gets the pairs of positive weight that are not padding, but gets no weights. If no pose is found, ``ok`` is
     false, and the pose is the identity. A problem is not solved if the library would get fewer than three pairs, if a
-    weight is negative, if a value is not finite, or if the camera has skew, a focal length of 0 or another fault.
+    weight is negative or not finite, if a coordinate that the library would get is not finite, or if the camera has
+    skew, a focal length of 0 or another fault. The values of padding are ignored.
 
     Convention: ``x_cam = R x_world + t``, +z forward, pixels ``u = fx x/z + cx``.
 
@@ -118,7 +119,8 @@ class PeerSolver(nn.Module):
         # If a focal length is negative, the pixels are reflected, because not every peer supports such cameras.
         signs = cameras.diagonal(dim1=1, dim2=2).sign()
         img, cameras = img * signs[:, None, :2], signs[..., None] * cameras
-        sound = world.isfinite().all(-1) & img.isfinite().all(-1) & shares.isfinite() & (shares >= 0) | ~present
+        sound = torch.cat((world, img), -1).isfinite().all(-1) | ~used
+        sound &= shares.isfinite() & (shares >= 0) | ~present
         status = torch.where(used.sum(-1) >= MIN_PAIRS, Status.NOT_BELIEVED, Status.TOO_FEW_PAIRS)
         status = torch.where(pinhole, status, Status.CAMERA)
         status = torch.where(sound.all(-1), status, Status.NOT_FINITE)

@@ -82,7 +82,10 @@ def test_rubbish_of_any_size_neither_raises_nor_comes_back_infinite(name, genera
     img[::11] = img[::11, :1]
     world[::13] = world[::13, :1] * torch.arange(8)[:, None]
     present = torch.rand(48, 8, generator=generator) < 0.7
-    result = make(name)(world, img, torch.diag(torch.tensor([3400.0, 3400.0, 1.0])).double(), mask=present)
+    world[~present], masked = torch.nan, ~present & (torch.arange(8) < 4)  # the rest has the weight 0
+    camera = torch.diag(torch.tensor([3400.0, 3400.0, 1.0])).double()
+    result = make(name)(world, img, camera, present.double(), ~masked)
+    assert result.status.equal(make(name)(world, img, camera, mask=present).status)
     assert all(part.isfinite().all() for part in iter_tensors(result))
     assert (result.weights[~present] == 0).all()
     assert 0 < result.ok.sum() < 48
