@@ -79,7 +79,7 @@ def checked_inputs(
     if weights is not None and weights.shape == (*pairs, 2):
         got = f"one weight for each pair, not for each of u and v: got {tuple(weights.shape)}"
         raise ShapeError(f"weights must have the shape {tuple(pairs)}, {got}.")
-    matrices = _cameras(intrinsics, size)
+    matrices = camera_matrices(intrinsics, size)
     of_pair = is_rig and matrices.ndim == len(size) + 3
     of_camera = () if matrices.ndim == 2 else pairs if of_pair else size
     shapes: Shapes = {
@@ -169,16 +169,9 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, l
     """Return the caller's camera matrices of a rig, for each problem or each pair, scaled to a last entry of 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
-    matrices = _cameras(intrinsics, size).to(like.dtype)
+    matrices = camera_matrices(intrinsics, size).to(like.dtype)
     matrices = matrices / matrices[..., 2:, 2:]
     return matrices.expand(*size, 3, 3) if matrices.ndim == 2 else matrices
-
-
-def _cameras(intrinsics: Tensor | PinholeCamera, size: torch.Size) -> Tensor:
-    """Return camera matrices. The batch dimension of Kornia's cameras is split into the dimensions ``size``."""
-    matrices = camera_matrices(intrinsics)
-    one_batch = isinstance(intrinsics, PinholeCamera) and matrices.ndim == 3 and len(matrices) == size.numel()
-    return matrices.reshape(*size, 3, 3) if one_batch else matrices
 
 
 def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | None, any_number: bool) -> PnPResult:

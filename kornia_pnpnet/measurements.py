@@ -146,7 +146,7 @@ def depth_points(
     if img_sigma is not None and img_cov is not None:
         raise ValueCheckError("Give img_sigma or img_cov, not both.")
     *batch, count = img_points.shape[:-1]
-    camera = camera_matrices(intrinsics)
+    camera = camera_matrices(intrinsics, img_points.shape[:-2])
     check_tensors({"intrinsics": camera})
     shapes: Shapes = {
         "depth": (depth, (*batch, count)),

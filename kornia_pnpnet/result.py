@@ -157,12 +157,17 @@ class Pose(NamedTuple):
         return PinholeCamera(Rt_to_matrix4x4(matrices, no_shift), self.matrix.reshape(-1, 4, 4), *size)
 
 
-def camera_matrices(intrinsics: Tensor | PinholeCamera) -> Tensor:
-    """Camera matrices (B, 3, 3) or (3, 3) of ``intrinsics``. The extrinsics of Kornia's camera are ignored."""
+def camera_matrices(intrinsics: Tensor | PinholeCamera, size: torch.Size | None = None) -> Tensor:
+    """Camera matrices (*, 3, 3) or (3, 3) of ``intrinsics``. The extrinsics of Kornia's cameras are ignored.
+
+    Kornia's cameras have one batch dimension. This dimension is split into ``size`` if the numbers of cameras agree.
+    """
     if not isinstance(intrinsics, PinholeCamera):
         return intrinsics
     matrices = intrinsics.camera_matrix
-    return matrices[0] if len(matrices) == 1 else matrices
+    if len(matrices) == 1:
+        return matrices[0]
+    return matrices if size is None or len(matrices) != size.numel() else matrices.reshape(*size, 3, 3)
 
 
 def check_pose(name: str, pose: Pose) -> None:

@@ -16,7 +16,7 @@ from kornia.core.exceptions import ShapeError
 from kornia.geometry import solve_pnp_dlt
 from kornia.geometry.camera.perspective import project_points
 
-from kornia_pnpnet import PnPNet, Pose, create_solver, pose_covariance, registry, solve_pnp
+from kornia_pnpnet import PnPNet, Pose, create_solver, depth_points, pose_covariance, registry, solve_pnp
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine.residual import project
@@ -73,11 +73,13 @@ def apply(folder):
     run(folder, "git", "apply", "--exclude=docs/*", *map(str, PATCHES), GIT_CEILING_DIRECTORIES=str(folder.parent))
 
 
-def test_patch_applies_to_the_installed_kornia(tmp_path):
+def test_patch_applies_to_the_installed_kornia_and_its_page_is_written_from_the_file(tmp_path):
     shutil.copytree(INSTALLED / "geometry" / "calibration", tmp_path / CHANGED)
     apply(tmp_path)
     assert (tmp_path / CHANGED / "pnp_robust.py").exists()
     assert "solve_pnp_robust" in (tmp_path / CHANGED / "__init__.py").read_text()
+    results = json.loads((REPO / "benchmarks" / "upstream.json").read_text())
+    assert upstream.page(results) in (REPO / "docs" / "upstream.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -99,11 +101,6 @@ def test_patch_is_measured_beside_the_others():
     assert rows["solve_pnp_dlt"]["success"] < 0.5
     assert all(row["us"] > 0 for row in upstream.measure_batches((2,)))
     assert all(row["last"] < row["first"] for row in upstream.measure_descent(4, (0.0,)))
-
-
-def test_tables_of_the_page_are_written_from_the_file():
-    results = json.loads((REPO / "benchmarks" / "upstream.json").read_text())
-    assert upstream.page(results) in (REPO / "docs" / "upstream.md").read_text(encoding="utf-8")
 
 
 def cameras(intrinsics):
@@ -144,8 +141,11 @@ def test_cameras_at_a_pose_project_as_we_do(make_problems):
     shared = p.pose.camera(p.intrinsics[0].float(), height=480, width=640)
     assert (shared.intrinsics.dtype, shared.intrinsics.shape) == (torch.float64, (5, 4, 4))
     assert shared.width.tolist() == [640.0] * 5
-    nested = Pose(*(x.unflatten(0, (1, 5)) for x in p.pose)).camera(camera)  # Kornia's cameras are one batch
-    assert nested.extrinsics.equal(camera.extrinsics)
+    nested = Pose(*(x[None] for x in p.pose))  # Kornia's cameras are one batch
+    assert nested.camera(camera).extrinsics.equal(camera.extrinsics)
+    depth = {"depth": torch.ones(1, 5, 9), "depth_sigma": 0.1, "pose": nested}
+    lifted = [depth_points(p.img_points[None], intrinsics=x, **depth) for x in (p.intrinsics[None], camera)]
+    torch.testing.assert_close(*lifted)
 
 
 def test_solve_pnp_returns_what_kornias_dlt_does(make_problems):
