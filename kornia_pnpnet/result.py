@@ -34,7 +34,7 @@ from kornia_pnpnet.core.checks import (
     check_tensors,
     common_dtype,
 )
-from kornia_pnpnet.core.linalg import gate, nearest_rotation
+from kornia_pnpnet.core.linalg import gate, nearest_rotation, up_to_scale
 from kornia_pnpnet.core.performance import full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 
@@ -92,10 +92,11 @@ class Pose(NamedTuple):
         r"""A pose from a translation and a quaternion in the order :math:`(w, x, y, z)` of COLMAP and Kornia.
 
         Args:
-            quaternion: quaternion of any length except 0, shape :math:`(B, 4)`.
+            quaternion: quaternion of any finite length, shape :math:`(B, 4)`. The length 0 gives the identity.
             translation: shape :math:`(B, 3)`.
         """
-        return cls._of_vectors(quaternion_to_rotation_matrix, "quaternion", quaternion, 4, translation)
+        rotate = quaternion_to_rotation_matrix
+        return cls._of_vectors(lambda x: rotate(up_to_scale(x)), "quaternion", quaternion, 4, translation)
 
     @classmethod
     def _of_vectors(

@@ -175,8 +175,11 @@ def test_solve_pnp_marks_what_it_cannot_solve(make_problems):
 def test_rotation_vectors_become_rotations_and_back_with_finite_gradients(angle, dtype, generator):
     axis = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=-1)
     vector = (angle * axis).to(dtype).requires_grad_()
-    rotation = Pose.from_rvec(vector, torch.zeros_like(vector)).rotation
-    back = Pose(rotation, torch.zeros_like(vector)).rvec
+    pose = Pose.from_rvec(vector, torch.zeros_like(vector))
+    for size in (1e-30, 1e30):
+        found = Pose.from_quaternion(size * pose.quaternion, vector).rotation
+        torch.testing.assert_close(found, pose.rotation, rtol=0, atol=1e-6)
+    back = pose.rvec
     if angle < 3.1:  # at a half turn two vectors give one rotation
         torch.testing.assert_close(back, vector, rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-3)
     assert torch.autograd.grad(back.sum(), vector)[0].isfinite().all()

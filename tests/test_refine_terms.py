@@ -167,9 +167,10 @@ def test_gravity_chooses_among_poses(name, make_problems, generator):
     assert rate(found[1], problems) > rate(found[0], problems) + 0.02
 
 
-def test_opposite_directions(generator):
+@pytest.mark.parametrize("size", [1e-200, 1.0, 1e200])
+def test_opposite_directions_of_any_length(size, generator):
     down = torch.randn(4, 3, generator=generator, dtype=torch.float64)
-    prior = gravity_prior(down, -down, torch.tensor(0.1, dtype=torch.float64))
+    prior = gravity_prior(size * down, -size * down, torch.tensor(0.1, dtype=torch.float64))
     torch.testing.assert_close((prior.pose.rotation @ down[..., None])[..., 0], -down)
     torch.testing.assert_close(torch.linalg.det(prior.pose.rotation), torch.ones(4, dtype=torch.float64))
 
