@@ -51,7 +51,7 @@ _WIDEST = 1.4835
 
 def undistort(
     img_points: Tensor, intrinsics: Tensor, dist: Tensor | None, fisheye: Tensor | None, noise: Noise | None
-) -> tuple[Tensor, Tensor, Noise | None]:
+) -> tuple[Tensor, Tensor, Tensor, Noise | None]:
     r"""Replace distorted pixels by pixels of the pinhole camera that has the same intrinsics.
 
     Newton's method inverts the distortion, and the implicit function theorem gives the gradient of the inverse. Unlike
@@ -65,10 +65,11 @@ def undistort(
         noise: noise of the distorted pixels.
 
     Returns:
-        The undistorted pixels; whether each pixel has a solution, bool :math:`(B, N)`; and the noise of the undistorted
-        pixels. A pixel has no solution if it is outside the range of the polynomial, if it is more than 85 degrees off
-        the axis of a fisheye, or if pixel, camera or coefficients are invalid. The principal point replaces a pixel
-        without a solution. Sigmas are multiplied by the Frobenius norm of the undistortion's Jacobian, divided by √2.
+        The undistorted pixels; whether each pixel has a solution, bool :math:`(B, N)`; the scale of each pixel, shape
+        :math:`(B, N)`; and the noise of the undistorted pixels. A pixel has no solution if it is outside the range of
+        the polynomial, if it is more than 85 degrees off the axis of a fisheye, or if pixel, camera or coefficients are
+        invalid. The principal point replaces a pixel without a solution. The scale multiplies sigmas. It is the
+        Frobenius norm of the undistortion's Jacobian, divided by √2.
     """
     check_form(["B", "N", "2"], img_points=img_points)
     camera, _ = pinholes(intrinsics)
@@ -78,23 +79,24 @@ def undistort(
         found = found & (point.detach().norm(dim=-1) < _WIDEST)
         point = torch.where(found[..., None], point, 0.0)
     pixels = transform_points(camera, flatten(point))
+    with torch.no_grad():  # derivative of the undistorted point with respect to the distorted point
+        jacobian = _linearised(flatten, point)[1] @ _inverse(_linearised(lens, point)[1])
+        eye = torch.eye(2, dtype=jacobian.dtype, device=jacobian.device)
+        jacobian = torch.where(found[..., None, None], jacobian, eye)
+    to_pixels = camera[:, None, :2, :2]
+    jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
+    scale = (0.5 * jacobian.square().sum((-1, -2))).sqrt()
     if noise is not None:
-        with torch.no_grad():  # derivative of the undistorted point with respect to the distorted point
-            jacobian = _linearised(flatten, point)[1] @ _inverse(_linearised(lens, point)[1])
-            eye = torch.eye(2, dtype=jacobian.dtype, device=jacobian.device)
-            jacobian = torch.where(found[..., None, None], jacobian, eye)
-        to_pixels = camera[:, None, :2, :2]
-        jacobian = to_pixels @ torch.linalg.solve_triangular(to_pixels, jacobian, upper=True, left=False)
         # Noise that is not finite (an unknown sigma is NaN) stays unchanged, and gives the camera no gradient.
-        factor, finite = (0.5 * jacobian.square().sum((-1, -2))).sqrt(), noise.img.isfinite()
-        noise = noise._replace(img=torch.where(finite, torch.where(finite, noise.img, 0.0) * factor, noise.img))
+        finite = noise.img.isfinite()
+        noise = noise._replace(img=torch.where(finite, torch.where(finite, noise.img, 0.0) * scale, noise.img))
         if noise.img_cov is not None:
             (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
             finite = torch.stack([*noise.img_cov]).isfinite().all(0)
             cov = map_tensors(lambda x: torch.where(finite, x, 0.0), noise.img_cov).mapped(a, b, d, c)
             cov = map_tensors(lambda x, y: torch.where(finite, x, y), cov, noise.img_cov)
             noise = noise._replace(img_cov=cov)
-    return pixels, found, noise
+    return pixels, found, scale.detach(), noise
 
 
 def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None) -> Inputs:
@@ -110,10 +112,11 @@ def with_undistorted(inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None
     unusable = ~lens.detach().isfinite().all(-1)[:, None]
     broken = ~inputs.img_points.isfinite().all(-1) | ~pinholes(inputs.intrinsics)[1][:, None] | unusable
     seen = torch.where(broken[..., None], 0.0, inputs.img_points)
-    pixels, found, noise = undistort(seen, inputs.intrinsics, dist, fisheye, inputs.noise)
+    pixels, found, scale, noise = undistort(seen, inputs.intrinsics, dist, fisheye, inputs.noise)
     mask = found | broken if inputs.mask is None else (found | broken) & inputs.mask
     pixels = torch.where(broken[..., None], inputs.img_points, pixels)
-    return inputs._replace(img_points=torch.where(unusable[..., None], torch.nan, pixels), mask=mask, noise=noise)
+    pixels = torch.where(unusable[..., None], torch.nan, pixels)
+    return inputs._replace(img_points=pixels, mask=mask, noise=noise, lens_scale=scale)
 
 
 @full_precision

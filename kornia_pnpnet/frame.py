@@ -41,7 +41,8 @@ class Frame(NamedTuple):
         centroid: the world point that became the origin, shape :math:`(B, 3)`.
         size: the length in the caller's world that became 1, shape :math:`(B,)`.
         img_scale: factor from the caller's pixels to the problem's pixels (geometric mean of the absolute factors of u
-            and v), shape :math:`(B,)`. In a rig, the factor is the geometric mean over the pairs.
+            and v), shape :math:`(B,)`. In a rig, the factor is the geometric mean over the pairs. For distorted
+            pixels, the solver multiplies the factor by the geometric mean of ``Inputs.lens_scale``.
         order: position of each normalised pair in the input, int64, shape :math:`(B, N)`; ``None``: the same order.
         status: ``Status.SOLVED`` or the reason why the problem is invalid, int64, shape :math:`(B,)`.
         intrinsics: the camera matrices, scaled to a last entry of 1, shape :math:`(B, 3, 3)`, or :math:`(B, N, 3, 3)`

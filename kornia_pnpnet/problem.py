@@ -92,6 +92,8 @@ class Inputs(NamedTuple):
         rig: the transform from the rig to the camera of each pair.
         free_focal: range and prior of an unknown focal length in the caller's pixels, see :class:`Problem`.
         radial: coefficients of the radial distortion that ``with_found_focal`` estimated and removed from the pixels.
+        lens_scale: number of undistorted pixels per distorted pixel at each pair, without gradient, shape
+            :math:`(B, N)`; ``None``: the caller's pixels were not distorted.
     """
 
     world_points: Tensor
@@ -106,6 +108,7 @@ class Inputs(NamedTuple):
     rig: Pose | None = None
     free_focal: Any = None
     radial: Tensor | None = None
+    lens_scale: Tensor | None = None
 
 
 class Linear(NamedTuple):

@@ -56,7 +56,7 @@ def test_undistorted_pixels_are_distorted_back_and_kornias(number, uniform):
     _, pixels, _ = seen(uniform, 3, 50)
     camera, dist = CAMERA.expand(3, 3, 3), DIST[:number].expand(3, -1)
     seen_pixels = distort_points(pixels, camera, dist)
-    found, there, _ = undistort(seen_pixels, camera, dist, None, None)
+    found, there, *_ = undistort(seen_pixels, camera, dist, None, None)
     assert there.all()
     torch.testing.assert_close(found, pixels, rtol=0, atol=1e-8)
     torch.testing.assert_close(found, undistort_points(seen_pixels, camera, dist, num_iters=200), rtol=0, atol=1e-6)
@@ -67,7 +67,7 @@ def test_fisheyes_agree_with_opencv(uniform):
     _, pixels, _ = seen(uniform, 1, 50)
     plane = transform_points(torch.linalg.inv(CAMERA), pixels).reshape(-1, 1, 2).numpy()
     seen_pixels = torch.from_numpy(cv2.fisheye.distortPoints(plane, CAMERA.numpy(), FISHEYE.numpy())).view(1, 50, 2)
-    found, there, _ = undistort(seen_pixels, CAMERA[None], None, FISHEYE[None], None)
+    found, there, *_ = undistort(seen_pixels, CAMERA[None], None, FISHEYE[None], None)
     assert there.all()
     torch.testing.assert_close(found, pixels, rtol=0, atol=1e-6)
     rays = bearings(seen_pixels, CAMERA, fisheye=FISHEYE) @ CAMERA.mT
@@ -79,7 +79,7 @@ def test_where_there_is_no_pixel():
     turning = torch.tensor([[-0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
     for off, dist, fisheye in ((0.9, turning, None), (2.0, None, 0.0 * turning)):  # 2 radians are 115 degrees
         pixels = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * off, 240.0]]], dtype=torch.float64)
-        _, there, _ = undistort(pixels, CAMERA[None], dist, fisheye, None)
+        _, there, *_ = undistort(pixels, CAMERA[None], dist, fisheye, None)
         assert there.tolist() == [[True, False]]
 
 
@@ -106,10 +106,23 @@ def test_the_noise_goes_through_the_lens(uniform):
     jacobian = torch.stack([(ahead - back) / 2e-4 for ahead, back in moved], -1)
     cov = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
     one = torch.ones(2, 9, dtype=torch.float64)
-    _, _, found = undistort(pixels, camera, dist, None, Noise(one, one, Symmetric2.of(cov.expand(2, 9, 2, 2))))
+    *_, found = undistort(pixels, camera, dist, None, Noise(one, one, Symmetric2.of(cov.expand(2, 9, 2, 2))))
     expected = Symmetric2.of(jacobian @ cov @ jacobian.mT)
     torch.testing.assert_close(tuple(found.img_cov), tuple(expected), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.img, (0.5 * jacobian.square().sum((-1, -2))).sqrt(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])
+def test_sigma_is_that_of_the_pixels_of_a_fisheye(name, uniform, generator):
+    """Of the caller's, not of undistorted pixels, out to 60 degrees off the axis."""
+    angle, around = uniform(300, 40, 1, low=0.0, high=math.radians(60.0)), uniform(300, 40, 1, high=math.pi)
+    across = torch.cat((around.cos(), around.sin()), -1) * uniform(300, 40, 1).sign()
+    points = torch.cat((angle.sin() * across, angle.cos()), -1) * uniform(300, 40, 1, low=2.0, high=6.0)
+    pixels = 400.0 * angle * across + torch.randn(300, 40, 2, generator=generator, dtype=torch.float64)
+    camera = torch.diag(torch.tensor([400.0, 400.0, 1.0]))
+    for noise, limit in (({}, 0.1), ({"img_sigma": 1.0}, 0.02)):
+        result = create_solver(name)(points, pixels, camera, fisheye=0.0 * FISHEYE, **noise)
+        assert result.sigma.median().item() == pytest.approx(1.0, abs=limit)
 
 
 @pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])

@@ -108,7 +108,8 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
             pose = put(pose, rows, take(frame.undo(at.pose), rows))
             camera = torch.where(finite[:, None], at.camera, 0.0)
         inputs = _zoomed(inputs, camera[:, 0])
-        inputs = with_undistorted(inputs, as_dist(camera[:, 1:]), None)._replace(radial=camera[:, 1:])
+        inputs = with_undistorted(inputs, as_dist(camera[:, 1:]), None)
+        inputs = inputs._replace(radial=camera[:, 1:], lens_scale=None)  # the refinement distorts the pixels again
     return inputs._replace(init=pose if inputs.init is None else inputs.init)
 
 
