@@ -37,6 +37,7 @@ __all__ = [
     "reproject",
     "undistort",
     "with_undistorted",
+    "zoomed",
 ]
 
 # Numbers of distortion coefficients that Kornia and OpenCV accept.
@@ -243,6 +244,24 @@ def reproject(world_points: Tensor, intrinsics: Tensor, pose: Pose) -> Tensor:
     in_front = cam_points[..., 2:] > 0
     pixels = convert_points_from_homogeneous(torch.where(in_front, cam_points, 1.0) @ intrinsics.mT, eps=0.0)
     return torch.where(in_front, pixels, torch.nan)
+
+
+def zoomed(plane_points: Tensor, dist: Tensor | None, fisheye: Tensor | None) -> Tensor:
+    r"""Derivative with respect to log f of the distorted pixels of known points, expressed in undistorted pixels.
+
+    If the lens maps the point :math:`p` of the plane z = 1 to :math:`D(p)`, the derivative of the distorted pixel is
+    :math:`f D(p)`. The result is :math:`(\partial D / \partial p)^{-1} D(p)`, shape (B, N, 2), in focal lengths.
+    Coefficients that are not finite become 0.
+    """
+    dist, fisheye = map_tensors(lambda x: x.nan_to_num(0.0, 0.0, 0.0), (dist, fisheye))
+    lens = _lens(fisheye if dist is None else dist, is_fisheye=dist is None)
+
+    def distorted(point: Tensor) -> Tensor:
+        radius = _angle(point)  # the tangent of the angle, because the point lies on the plane
+        return lens(point if fisheye is None else radius.atan() / radius * point)
+
+    seen, jacobian = _linearised(distorted, plane_points)
+    return (_inverse(jacobian) @ seen[..., None])[..., 0]
 
 
 def _through(

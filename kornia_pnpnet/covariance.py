@@ -12,6 +12,7 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
+from kornia_pnpnet.cameras import zoomed
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
@@ -128,6 +129,10 @@ def pose_covariance(
     size_of_camera = 0 if focal == "known" else 1
     state = State(framed_pose, problem.weights.new_zeros(len(problem.weights), size_of_camera))
     projection = project(state, problem)
+    if size_of_camera and (dist is not None or fisheye is not None):
+        lens = map_tensors(lambda x: x.double().expand(*size, -1).reshape(size.numel(), x.shape[-1]), (dist, fisheye))
+        added = zoomed(projection.plane.permute(2, 1, 0), *lens).permute(2, 1, 0) - projection.plane
+        projection = projection._replace(lens=added * (projection.rotated[2] + framed_pose.translation[:, 2]))
     total = problem.weights.sum(-1, keepdim=True)
     mean = problem.weights.square().sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
     inlier = (problem.weights / torch.where(mean > 0, mean, 1.0)).clamp(max=1.0)

@@ -1,7 +1,6 @@
 """Laws that every solver keeps, written once: ``test_laws.py`` runs them over solvers, cameras, noise and dtypes.
 
-A :class:`Case` names what is combined, :func:`make` draws its problems as the arguments of one call, and each law
-compares that call with a changed one. Everything speaks through the public contract.
+Each law compares the call that :func:`make` draws for a :class:`Case` with a changed call.
 """
 
 import copy
@@ -80,11 +79,9 @@ def build(case: Case) -> PnPNet:
 
 
 def make(case: Case, batch: int = BATCH, seed: int = 0) -> tuple[Call, Pose]:
-    """Arguments of a call, and the true poses. The last pair is an outlier where the solver is robust from its start.
-
-    The points are those of the protocol. In a rig every third pair belongs to a camera turned by a third of a turn;
-    bearings are turned to all sides.
-    """
+    """Arguments of a call, and the true poses. The last pair is an outlier if the solver is robust from its start."""
+    # The points are those of the protocol. In a rig every third pair belongs to a camera turned by a third of a turn;
+    # bearings are turned to all sides.
     n = PAIRS if case.takes_any_n else int(re.search(r"-n(\d+)", case.solver)[1])
     is_robust = not case.solver.startswith(("epnp", "reppnp", "identity", "net", *OPENCV))
     outliers = int(is_robust and case.focal == "known")
@@ -525,11 +522,9 @@ LAWS += [defaults_are_free, copies_are_the_same, wrong_arguments_are_refused]
 
 
 def applies(law: Callable[[Case], None], case: Case) -> bool:
-    """Whether the contract promises the law to the solver.
-
-    A first guess alone may come from a sample, which is a constant, and a network of a fixed number of pairs makes
-    nothing of fewer without a refinement.
-    """
+    """Whether the contract promises the law to the solver."""
+    # A first guess alone may come from a sample, which is a constant, and a network of a fixed number of pairs makes
+    # nothing of fewer without a refinement.
     if law is isotropic_covariances_are_sigmas:
         return case.noise == "sigma"
     if law is unknown_sigmas_are_ignored:

@@ -19,6 +19,8 @@ from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.losses import SetLoss
 from kornia_pnpnet.problem import Noise
+from kornia_pnpnet.propose.focal import scale_focal
+from kornia_pnpnet.refine.residual import retract
 
 #: Coefficients of Kornia and OpenCV; the models take the first 4, 5, 8, 12 or 14.
 DIST = torch.tensor(
@@ -97,19 +99,27 @@ def test_distorted_pixels_are_solved_without_those_that_no_point_has(name, lens,
     torch.testing.assert_close(matrices, of_each.matrix[:, :3])
 
 
-def test_the_noise_goes_through_the_lens(uniform):
-    """As the differences of undistorted pixels; the equivalent sigma has the same mean square."""
-    _, pixels, _ = seen(uniform, 2, 9)
-    dist, camera = DIST.expand(2, -1), CAMERA.expand(2, 3, 3)
-    step = 1e-4 * torch.eye(2, dtype=torch.float64)
-    moved = [[undistort(pixels + x, camera, dist, None, None)[0] for x in (axis, -axis)] for axis in step]
-    jacobian = torch.stack([(ahead - back) / 2e-4 for ahead, back in moved], -1)
-    cov = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
-    one = torch.ones(2, 9, dtype=torch.float64)
-    *_, found = undistort(pixels, camera, dist, None, Noise(one, one, Symmetric2.of(cov.expand(2, 9, 2, 2))))
-    expected = Symmetric2.of(jacobian @ cov @ jacobian.mT)
-    torch.testing.assert_close(tuple(found.img_cov), tuple(expected), rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(found.img, (0.5 * jacobian.square().sum((-1, -2))).sqrt(), rtol=1e-5, atol=1e-6)
+@pytest.mark.parametrize("lens", LENSES)
+def test_noise_and_an_unknown_focal_length_go_through_the_lens(lens, uniform):
+    """By the derivative of distorted pixels; the equivalent sigma has the same mean square."""
+    points, _, pose = seen(uniform, 2, 9)
+    camera, given = CAMERA.expand(2, 3, 3), {lens: (DIST if lens == "dist" else FISHEYE).expand(2, -1)}
+
+    def pixels(delta):
+        zoomed = scale_focal(camera, delta[6].exp())
+        cam = transform_points(retract(pose, delta[:6].mT).matrix, points)
+        return distorted(transform_points(zoomed, cam[..., :2] / cam[..., 2:]), zoomed, **given)
+
+    zero, cov = torch.zeros(7, 2, dtype=torch.float64), torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    jacobian = torch.autograd.functional.jacobian(lambda x: pixels(x).sum(0), zero).permute(3, 0, 1, 2)
+    noise = {"img_cov": cov.expand(2, 9, 2, 2), "focal": "unknown"}
+    found = pose_covariance(pose, points, pixels(zero), CAMERA, **noise, **given)
+    information = (jacobian.mT @ torch.linalg.inv(cov) @ jacobian).sum(1)
+    torch.testing.assert_close(found, torch.linalg.inv(information), rtol=1e-6, atol=1e-12)
+    one, lenses = torch.ones(2, 9, dtype=torch.float64), (given.get("dist"), given.get("fisheye"))
+    *_, scale, found = undistort(pixels(zero), camera, *lenses, Noise(one, one, Symmetric2(one, 0.0 * one, one)))
+    torch.testing.assert_close(found.img, (0.5 * (found.img_cov.uu + found.img_cov.vv)).sqrt())
+    assert found.img.equal(scale)
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "epnp-lm"])

@@ -191,10 +191,7 @@ def test_poses_covariances_and_weights_are_those_of_a_dense_solver():
     _, residual = whitened(p, robust.pose)
     distance = residual.unflatten(1, (-1, 2)).square().sum(-1)
     torch.testing.assert_close(robust.weights, 1.0 / (1.0 + distance / 9.0), rtol=1e-6, atol=0)
-
-
-def test_an_isotropic_covariance_is_a_sigma():
-    p, sigma = problems(), torch.linspace(0.01, 0.1, 36, dtype=DOUBLE).view(4, 9)
+    sigma = torch.linspace(0.01, 0.1, 36, dtype=DOUBLE).view(4, 9)  # of isotropic covariances
     noises = {"world_sigma": sigma}, {"world_cov": sigma.square()[..., None, None] * torch.eye(3, dtype=DOUBLE)}
     torch.testing.assert_close(*(pose_covariance(p.pose, *p[:3], img_cov=p.img_cov, **x) for x in noises))
 
@@ -257,9 +254,6 @@ def test_means_are_kornias_and_a_stride_is_each_cell_as_a_block_of_pixels(genera
     torch.testing.assert_close(pixels, spatial_soft_argmax2d(heatmaps, 0.5, normalized_coordinates=False))
     blocks = heatmaps.repeat_interleave(3, -1).repeat_interleave(3, -2)
     torch.testing.assert_close(heatmap_keypoints(heatmaps, stride=3.0), heatmap_keypoints(blocks))
-
-
-def test_gradients_of_heat_maps(generator):
     heatmaps = torch.randn(1, 2, 4, 5, generator=generator, dtype=DOUBLE, requires_grad=True)
     temperature = torch.tensor([[[[0.7]], [[1.3]]]], dtype=DOUBLE, requires_grad=True)
     assert gradcheck(heatmap_keypoints, (heatmaps, temperature))

@@ -52,6 +52,10 @@ def test_noise_is_normal_with_its_standard_deviation():
     assert torch.equal(noisy.img_points, clean.img_points)
     assert_normal(noisy.world_points - clean.world_points, 0.05)
     assert_normal(reprojection_errors(draw(9, world_sigma=0.0, img_sigma=3.0)), 3.0)
+    for share in (0.0, 1.0):  # also of outliers
+        options = {"outliers": OutlierMix(count=3, mismatch_share=share), "world_sigma": 0.0}
+        clean, noisy = (draw(9, 5000, img_sigma=sigma, **options) for sigma in (0.0, 1.0))
+        assert_normal((noisy.img_points - clean.img_points)[~clean.inliers], 1.0)
 
 
 @pytest.mark.parametrize("name", ["img_sigma", "world_sigma"])
@@ -265,13 +269,6 @@ def test_kinds_of_outliers_have_their_shares_and_pixels(generator):
     deciles = plain.img_points[..., 0].flatten().quantile(torch.linspace(0.1, 0.9, 9, dtype=torch.float64))
     shares = torch.bucketize(other[:, 0].contiguous(), deciles).bincount(minlength=10) / len(other)
     assert (shares - 0.1).abs().max() < 4 * math.sqrt(0.09 / len(other))
-
-
-@pytest.mark.parametrize("mismatch_share", [0.0, 1.0])
-def test_pixels_of_outliers_have_noise(mismatch_share):
-    mix = OutlierMix(count=3, mismatch_share=mismatch_share)
-    clean, noisy = (draw(9, 5000, outliers=mix, world_sigma=0.0, img_sigma=sigma) for sigma in (0.0, 1.0))
-    assert_normal((noisy.img_points - clean.img_points)[~clean.inliers], 1.0)
 
 
 def test_near_outliers_have_distances_in_pixels_beyond_the_noise():

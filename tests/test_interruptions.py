@@ -47,10 +47,7 @@ def in_a_process(function, *arguments):
 
 
 def with_kills(tmp_path, start, moments):
-    """Start processes until KILLS of them were killed at random moments, each folder until a process ends by itself.
-
-    Yields the folder after each process, and whether the process ended by itself.
-    """
+    """Start processes until KILLS were killed at random moments. Yield each folder, and whether its process ended."""
     chance, killed, run = random.Random(0), 0, 0
     while killed < KILLS:
         run, done = run + 1, False

@@ -16,6 +16,7 @@ from kornia_pnpnet import MLPInit, Normalize, PnPNet, PoseLoss, RobustWeightedLM
 from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
 from kornia_pnpnet.losses import pose_distances
+from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, OpenCVUsac, PeerSolver, PoseLib, PyColmap
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import SubsetSolver
@@ -223,6 +224,9 @@ WRONG = {
     "no stride": lambda: k.heatmap_keypoints(torch.zeros(1, 2, 4, 5), stride=0),
     "temperatures": lambda: k.heatmap_keypoints(torch.zeros(1, 2, 4, 5), torch.ones(3, 1, 1, 1)),
     "limits": lambda: k.success(k.pose_errors(POSES, POSES), max_translation=torch.ones(2, 1)),
+    "outcomes": lambda: reliability(torch.rand(3), torch.ones(2).bool()),
+    "no outcome": lambda: reliability(torch.rand(0), torch.ones(0).bool()),
+    "no range": lambda: reliability(torch.rand(3), torch.ones(3).bool(), 0),
     "origin": lambda: pose_distances(POSES, POSES, torch.zeros(3)),
     "gravity": lambda: k.gravity_prior(torch.ones(2, 3), torch.ones(3), 0.1),
     "estimates": lambda: k.pose_errors(k.Pose(CAMERA[None], torch.zeros(2, 3)), POSES),

@@ -404,7 +404,9 @@ def test_operations_shared_by_the_batch_are_not_counted(batch):
     assert cost == pytest.approx(flops(add=5 * 4 + 5, multiply=5 * 5))
 
 
-def test_a_network_costs_a_product_and_a_sum_for_each_weight():
+def test_a_network_costs_a_product_and_a_sum_for_each_weight_and_iterations_cost_the_same():
+    counts = [operation_count(f"identity-lm:m={m}", 9) for m in (1, 2, 30)]
+    assert counts[2] - counts[1] == pytest.approx(28 * (counts[1] - counts[0]))
     network = MLPInit(20)
     weights = sum(p.numel() for name, p in network.named_parameters() if name.endswith("weight"))
     alone = operation_count(PnPNet(network, RobustWeightedLM(0)), 20) - operation_count("identity-lm:m=0", 20)
@@ -420,11 +422,6 @@ def test_counts_do_not_depend_on_the_data(name, make_problems):
         inputs = make_problems(n=9, batch=128, outliers=outliers, noise=outliers > 0, seed=outliers)[:3]
         counted = count_per_problem(lambda batch, inputs=inputs: solver(*(part[:batch] for part in inputs)), 64)
         assert counted == operation_count(name, 9)
-
-
-def test_an_iteration_costs_the_same_each_time():
-    counts = [operation_count(f"identity-lm:m={m}", 9) for m in (1, 2, 30)]
-    assert counts[2] - counts[1] == pytest.approx(28 * (counts[1] - counts[0]))
 
 
 def test_ransac_draws_more_samples_with_more_outliers_and_more_confidence():

@@ -357,11 +357,9 @@ def test_solvers_stay_where_their_inputs_are(name, make_problems):
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
 @pytest.mark.parametrize("name", [x for x in k.list_solvers() if x not in PEERS])
 def test_transforms_of_every_solver_of_ours(name):
-    """First derivatives against ``backward``, second against central differences of it, ``vmap`` against a loop.
-
-    Pixels move along three directions. Where the pose is found from a start that is a constant, derivatives leave out
-    what the start would change, which the last iterations nearly forget: hence the tolerance of second derivatives.
-    """
+    """First derivatives against ``backward``, second against central differences of it, ``vmap`` against a loop."""
+    # Pixels move along three directions. Where the pose is found from a start that is a constant, derivatives leave out
+    # what the start would change, which the last iterations nearly forget: hence the tolerance of second derivatives.
     number = re.search(r"-n(\d+)", name)
     chosen = {"m": 2} if name.endswith("-lm") or "pnpnet-n" in name else {}
     chosen |= {"pnpnet-set": {"m": 8, "effort": "fixed"}, "ransac-epnp-lm": {"max_samples": 20}}.get(name, {})

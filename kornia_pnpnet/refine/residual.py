@@ -71,6 +71,8 @@ class Projection(NamedTuple):
         stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
             ``None``: there is no distortion.
         slope: twice the derivative :math:`\partial d / \partial \rho^2`, shape :math:`(N, B)`; ``None``: no distortion.
+        lens: term that the known distortion of undistorted pixels adds to the Jacobian's column of log f, times z/f,
+            shape :math:`(2, N, B)`; ``None``: 0.
     """
 
     residual: Tensor
@@ -83,6 +85,7 @@ class Projection(NamedTuple):
     state: State
     stretch: Tensor | None = None
     slope: Tensor | None = None
+    lens: Tensor | None = None
 
     @property
     def sq_residual(self) -> Tensor:
@@ -271,7 +274,8 @@ def _jacobian(projection: Projection, problem: Problem) -> Tensor:
         square = plane.square().sum(0)
         zoomed = projection.stretch * y3 - projection.slope * square * (depth - y3)
         moved_by = torch.cat((zoomed, *((depth * square**power)[None] for power in range(1, unknown))))
-    return torch.cat((jacobian, plane * moved_by[:, None]))
+    camera = plane * moved_by[:, None]
+    return torch.cat((jacobian, camera if projection.lens is None else camera + projection.lens))
 
 
 def _stacked_equations(projection: Projection, problem: Problem, weights: Tensor | Symmetric2) -> tuple[Tensor, Tensor]:
@@ -321,7 +325,7 @@ def _entrywise_equations(
 
 def _columns(projection: Projection, problem: Problem) -> list[_Column]:
     """The columns of :func:`_jacobian`. Without rig and distortion, two columns are constant, which saves time."""
-    if problem.rig is not None or projection.stretch is not None:
+    if problem.rig is not None or projection.stretch is not None or projection.lens is not None:
         return [(u, v) for u, v in _jacobian(projection, problem)]
     y1, y2, y3 = projection.rotated.unbind()
     p, q = projection.plane.unbind()
