@@ -390,12 +390,12 @@ class PnPNet(PretrainedMixin):
             term, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
             problem, init = problem._replace(pose_terms=(term,)), inputs.prior.pose if init is None else init
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
+        if inputs.free_focal is not None:
+            problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
         if inputs.lens_scale is not None:  # `sigma` is the noise of distorted pixels
             there = (frame.undo_pairs(problem.weights) > 0) & (inputs.lens_scale > 0)
             mean = torch.where(there, inputs.lens_scale, 1.0).log().sum(1) / there.sum(1).clamp(min=1)
             frame = frame._replace(img_scale=frame.img_scale * mean.exp())
-        if inputs.free_focal is not None:
-            problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
         given = None
         if self.init is None or init is not None:
             given, usable = frame.start(init)
