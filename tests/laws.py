@@ -407,8 +407,7 @@ def bad_problems_fail_alone(case: Case) -> None:
 def gradients_reach_the_inputs(case: Case) -> None:
     """Of each problem that is ok to points, pixels, cameras and noise; finite everywhere."""
     call = pytree.tree_map(lambda x: x.clone().requires_grad_(), make(case)[0])
-    result = build(case)(**call)
-    names = [name for name in call if name != "init"]
+    result, names = build(case)(**call), [name for name in call if name != "init"]
     leaves = [pytree.tree_leaves(call[name])[0] for name in names]
     total = result.rotation[:, 0].sum() + result.translation.sum()
     gradients = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
@@ -517,8 +516,7 @@ OF_BELIEVED = (batches_are_free, shuffled_is_ordered, units_are_free, frames_are
 NOT_OF_PEERS = (shuffled_is_ordered, units_are_free, frames_are_free, gradients_reach_the_inputs, copies_are_the_same)
 LAWS = [sound, *OF_BELIEVED, padding_is_nothing, reflections_are_free, bad_problems_fail_alone]
 LAWS += [gradients_reach_the_inputs, isotropic_covariances_are_sigmas, half_precision_is_converted]
-LAWS += [unknown_sigmas_are_ignored]
-LAWS += [defaults_are_free, copies_are_the_same, wrong_arguments_are_refused]
+LAWS += [defaults_are_free, copies_are_the_same, wrong_arguments_are_refused, unknown_sigmas_are_ignored]
 
 
 def applies(law: Callable[[Case], None], case: Case) -> bool:

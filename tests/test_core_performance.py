@@ -27,8 +27,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*should not be instantiated:Dep
 def backend(monkeypatch):
     """Dynamo captures and guards, its graphs run as they are: what needs no C++ compiler. Counts the graphs."""
     torch.compiler.reset()
-    counter = CompileCounter()
-    compile_ = torch.compile
+    counter, compile_ = CompileCounter(), torch.compile
     monkeypatch.setattr(torch, "compile", lambda function, options, **x: compile_(function, backend=counter, **x))
     yield counter
     torch.compiler.reset()

@@ -112,8 +112,7 @@ def test_exports(kind, name, n, batch, sizes, is_rig, make_problems, tmp_path):
             problems.world_points[3:4, 1] = torch.nan
         inputs = inputs_of(problems)
         inputs[3][:, 4:5] = 0.0 if name == "pnpnet-set" and n is None else 1.0
-        before = [x.clone() for x in inputs]
-        found = run(*inputs)
+        before, found = [x.clone() for x in inputs], run(*inputs)
         near(found, solver, inputs)
         assert all(torch.as_tensor(x).isfinite().all() for x in found[:4])
         assert is_rig or not found[4][3:4].any()

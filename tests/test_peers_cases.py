@@ -1,7 +1,6 @@
 """Our solvers on the cases of other libraries' public test suites, beside those libraries, and on wild pairs.
 
-The problems are drawn anew from the parameters of each suite; no data is taken from it. Every test asserts that each of
-our solvers solves at least as many problems as the best peer, minus a margin.
+Problems are drawn from a suite's parameters. Each of our solvers solves as many as the best peer, minus a margin.
 """
 
 import math
