@@ -50,8 +50,9 @@ class Solve:
 
     The result has the columns ``rotation`` (9), ``translation`` (3), ``weights`` (N), ``cost``, ``ok``, and ``status``
     (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). If the solver estimates an unknown focal
-    length, the result also has the estimates ``intrinsics`` (9) and ``dist`` (4). Rows keep their order. Other columns
-    of the table, for example ``id``, are kept. Numbers are float32.
+    length, the result also has the columns ``intrinsics`` (9) and ``dist`` (4) with the estimates. Malformed rows have
+    the identity and zeros there. Rows keep their order. Other columns of the table, for example ``id``, are kept.
+    Numbers are float32.
 
     A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. The status of a row is
     ``malformed`` if a list is missing or has an incorrect length, or if the solver does not accept the number of pairs.

@@ -247,11 +247,11 @@ def reproject(world_points: Tensor, intrinsics: Tensor, pose: Pose) -> Tensor:
 
 
 def zoomed(plane_points: Tensor, dist: Tensor | None, fisheye: Tensor | None) -> Tensor:
-    r"""Derivative with respect to log f of the distorted pixels of known points, expressed in undistorted pixels.
+    r"""Differentiate distorted pixels of known points by log f, and convert the derivative to undistorted pixels.
 
-    If the lens maps the point :math:`p` of the plane z = 1 to :math:`D(p)`, the derivative of the distorted pixel is
-    :math:`f D(p)`. The result is :math:`(\partial D / \partial p)^{-1} D(p)`, shape (B, N, 2), in focal lengths.
-    Coefficients that are not finite become 0.
+    The lens maps a point :math:`p` of the plane z = 1 to :math:`D(p)`. The derivative of the distorted pixel is
+    :math:`f D(p)`. Converted and divided by :math:`f`, it is :math:`(\partial D / \partial p)^{-1} D(p)`, which is
+    the result, shape (B, N, 2). Coefficients that are not finite become 0.
     """
     dist, fisheye = map_tensors(lambda x: x.nan_to_num(0.0, 0.0, 0.0), (dist, fisheye))
     lens = _lens(fisheye if dist is None else dist, is_fisheye=dist is None)

@@ -93,7 +93,7 @@ class Inputs(NamedTuple):
         free_focal: range and prior of an unknown focal length in the caller's pixels, see :class:`Problem`.
         radial: coefficients of the radial distortion that ``with_found_focal`` estimated and removed from the pixels.
         lens_scale: number of undistorted pixels per distorted pixel at each pair, without gradient, shape
-            :math:`(B, N)`; ``None``: the caller's pixels were not distorted.
+            :math:`(B, N)`; ``None``: the refinement fits the caller's pixels.
     """
 
     world_points: Tensor

@@ -293,7 +293,8 @@ class PnPNet(PretrainedMixin):
         """Solve a batch, and also return the starts (proposed poses, weights and noise) for training losses.
 
         For the arguments, except ``alternatives``, see :meth:`forward`. The starts are in the frame, order and units of
-        the inputs. The ``ok`` of the starts says whether the problem is valid.
+        the inputs. The sigma of a distorted pixel is that of the undistorted pixel, divided by the mean scale of the
+        lens. The ``ok`` of the starts says whether the problem is valid.
         """
         size, inputs = checked_inputs(*args, **options)
         self._is_rig(inputs, options.get("dist"), options.get("fisheye"))
@@ -321,7 +322,8 @@ class PnPNet(PretrainedMixin):
         The first call compiles for some seconds. A new number of pairs, a new dtype, or the first call with gradients
         causes a new compilation. A new batch size causes no compilation. RANSAC is never compiled. Parts that cannot
         be compiled run uncompiled after one warning. If there is no C++ compiler, or if PyTorch is older than 2.13, all
-        parts run uncompiled. A copy of the solver compiles again.
+        parts run uncompiled. A copy of the solver compiles again. If a part of the solver is replaced, the old part and
+        its code stay in memory until the next call of ``compile``.
 
         Args:
             mode: mode of ``torch.compile``; ``"reduce-overhead"`` captures CUDA graphs.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,8 @@ from kornia_pnpnet.refine.residual import retract
 # Scripts that are no part of the package and import each other.
 SCRIPTS = "benchmarks", "docs/results", "docs/examples"
 sys.path += [str(Path(__file__).resolve().parents[1] / folder) for folder in SCRIPTS]
+# On some processors MKL rounds a product of matrices differently if one of them has more columns.
+os.environ.setdefault("MKL_CBWR", "COMPATIBLE")
 # The tensors are small: threads only get into each other's way, above all under pytest-xdist.
 torch.set_num_threads(1)
 

@@ -184,8 +184,7 @@ def sound(case: Case) -> None:
     """Shapes, dtypes, rotations; the inputs stay as they are; most problems are solved."""
     call, truth = make(case)
     before = pytree.tree_map(torch.clone, call)
-    result = build(case)(**call)
-    n = call["world_points"].shape[1]
+    result, n = build(case)(**call), call["world_points"].shape[1]
     shapes = [(BATCH, 3, 3), (BATCH, 3), (BATCH, n), (BATCH,), (BATCH,), (BATCH, 4, 4)]
     assert [tuple(x.shape) for x in (*result[:5], result.matrix)] == shapes
     assert result.ok.dtype == torch.bool

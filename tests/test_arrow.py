@@ -116,8 +116,7 @@ BAD = {
 def test_a_bad_row_is_not_ok_and_changes_no_other(kind, draw):
     name, cell, status = BAD[kind]
     _, table = draw()
-    good = Solve("epnp-lm")(table)
-    cells = table[name].to_pylist()
+    good, cells = Solve("epnp-lm")(table), table[name].to_pylist()
     cells[2] = cell
     found = Solve("epnp-lm")(table.set_column(NAMES.index(name), name, pa.array(cells)))
     row = found.to_pylist()[2]

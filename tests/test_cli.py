@@ -463,8 +463,7 @@ def test_spoiled_results_are_a_line_and_no_traceback(tmp_path, drawn):
     arguments = "evaluate", "--solver", "epnp", "--problems", "20", "--n", "9,12", "--outliers", "none,3", "--out"
     assert run_main(*arguments, made)[0] == 0
     content = json.loads(made.read_text())
-    places = list(places_in(content))
-    codes = Counter()
+    places, codes = list(places_in(content)), Counter()
 
     @many(120)
     @given(spoiled(content, places))

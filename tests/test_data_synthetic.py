@@ -145,8 +145,7 @@ OPTIONS = {"sigma_spread": (0.1, 1.0), "degrees": (1.5, 9.0), "bunched_share": 0
 )
 def test_a_batch_depends_on_seed_and_index_alone(source):
     make = partial(source, n=6, batch_size=5)
-    state = torch.get_rng_state()
-    first = make(seed=3).batch(11)
+    state, first = torch.get_rng_state(), make(seed=3).batch(11)
     assert all(x.isfinite().all() for x in iter_tensors(first))
     assert torch.equal(torch.get_rng_state(), state), "drawing leaves the global generator alone"
     assert_same(make(seed=3).batch(11), first)
@@ -248,8 +247,7 @@ def test_outliers_are_at_random_positions(n):
     two = (~draw(n, outliers=OutlierMix(count=2)).inliers).double()
     assert_counts(two.sum(0))
     # Pairs of positions are as likely as each other: none attracts or repels its neighbour.
-    together = two.T @ two / COUNT
-    expected = 2 / (n * (n - 1))
+    together, expected = two.T @ two / COUNT, 2 / (n * (n - 1))
     assert (together[~torch.eye(n, dtype=torch.bool)] - expected).abs().max() < 4.5 * math.sqrt(expected / COUNT)
 
 

@@ -90,8 +90,7 @@ def hloc_errors(localize_sfm, folder, truth):
 
 @pytest.mark.slow
 def test_hloc_localises_its_queries_with_the_localizer_of_the_page(tmp_path, monkeypatch):
-    localize_sfm = real("hloc.localize_sfm")
-    truth = write_hloc_scene(tmp_path)
+    localize_sfm, truth = real("hloc.localize_sfm"), write_hloc_scene(tmp_path)
     theirs = hloc_errors(localize_sfm, tmp_path, truth)
     monkeypatch.setattr(localize_sfm, "QueryLocalizer", localize_sfm.QueryLocalizer)  # undone at the end
     snippet("examples/clients.md", "hloc")

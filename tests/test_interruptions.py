@@ -140,8 +140,7 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path):
     def start(out):
         return in_a_process(lambda: sys.exit(solve(source, out, "--batch-size", "500")))
 
-    began = time.monotonic()
-    process = start(whole)
+    began, process = time.monotonic(), start(whole)
     process.join()
     assert process.exitcode == 0
     amid, made = 0, {}

@@ -310,8 +310,7 @@ def test_the_likelihood_of_bad_problems_costs_nothing_and_changes_no_other():
     case = Case("epnp-lm", noise="sigma")
     kinds, sound, bad = make_bad(case)
     _, truth = make(case, len(sound["weights"]))
-    leaves = [x.requires_grad_() for x in bad.values()]
-    losses = []
+    leaves, losses = [x.requires_grad_() for x in bad.values()], []
     for call in (sound, bad):
         torch.manual_seed(0)
         losses.append(monte_carlo_pose_loss(truth, truth, **call))

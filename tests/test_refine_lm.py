@@ -175,8 +175,7 @@ def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, make_p
 
 def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_problems, perturb):
     p = make_problems(n=8, batch=2)
-    direction = torch.randn_like(p.img_points)
-    products = []
+    direction, products = torch.randn_like(p.img_points), []
     for backward in ("unroll", "implicit"):
         lm = RobustWeightedLM(60, kernel="cauchy", step=1.0, damping=1e-4, robustness=3.0, backward=backward)
         img = p.img_points.clone().requires_grad_()

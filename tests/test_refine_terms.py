@@ -175,6 +175,12 @@ def test_opposite_directions_of_any_length(size, generator):
     torch.testing.assert_close(torch.linalg.det(prior.pose.rotation), torch.ones(4, dtype=torch.float64))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_almost_level_camera_has_a_valid_prior_of_gravity(dtype):
+    down = torch.tensor([[x, 1.0, y * x] for x in (1e-4, 1e-3, 0.01) for y in (0.0, 0.3, 1.0)], dtype=dtype)
+    assert PoseTerm.of(gravity_prior(down, down, 0.02), *(torch.ones_like(down), torch.ones_like(down[:, 0])))[1].all()
+
+
 def test_gradients_of_gravity(generator):
     down = torch.randn(3, 1, 3, generator=generator, dtype=torch.float64)
     sigma = torch.full((1,), 0.02, dtype=torch.float64)

@@ -51,7 +51,8 @@ class KnownInliersAndNoise(Configured):
     Args:
         img_sigma: standard deviation of a pixel coordinate, for pairs whose problem does not give ``img_sigma``. The
             default is the value of the protocol's synthetic data.
-        world_sigma: the same for a world coordinate. The default is also the protocol's value.
+        world_sigma: standard deviation of a world coordinate, for pairs whose problem does not give ``world_sigma``.
+            The default is the value of the protocol's synthetic data.
 
     Raises:
         BaseError: for a standard deviation that is negative or not finite, or when both standard deviations are 0.

@@ -61,7 +61,7 @@ class RANSAC(Initialiser):
     Args:
         minimal: minimal solver, for example :class:`~kornia_pnpnet.propose.p3p.P3P` or
             :class:`~kornia_pnpnet.propose.minimal.SubsetSolver`.
-        threshold: :math:`\tau` in pixels of the user's camera.
+        threshold: :math:`\tau` in pixels of the user's camera; with distortion, in undistorted pixels.
         world_threshold: :math:`\omega` in the unit of the user's world.
         scorer: loss of a pair, ``"msac"`` (truncated square), ``"inliers"`` (1 for outliers, 0 for inliers), or a
             function (see ``kornia_pnpnet.propose.scoring.Scorer``).

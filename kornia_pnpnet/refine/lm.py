@@ -479,9 +479,9 @@ def taken(tree: _T, index: Tensor) -> _T:
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
     """Complete the noise of every pair. The initialiser gives the sigmas that the problem lacks.
 
-    If the initialiser gives no noise, the mean of the problem's known sigmas replaces each unknown sigma. If no sigma
-    is known, points get 0, and pixels get 1 (one pixel of the caller if there are terms), as without noise. If neither
-    gives noise, return ``None``.
+    If the initialiser gives no noise, the mean of the problem's known sigmas of pixels replaces each unknown sigma of a
+    pixel. The same holds for points. If no sigma is known, points get 0. Pixels get 1, as if no noise had been given,
+    but with terms one pixel of the caller. If neither the problem nor the initialiser has noise, return ``None``.
     """
     given, guess = problem.noise, starts.noise
     if given is None:

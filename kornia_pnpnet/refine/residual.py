@@ -71,8 +71,8 @@ class Projection(NamedTuple):
         stretch: :math:`d = 1 + k_1 \rho^2 + k_2 \rho^4` with :math:`\rho^2 = p^2 + q^2`, shape :math:`(N, B)`;
             ``None``: there is no distortion.
         slope: twice the derivative :math:`\partial d / \partial \rho^2`, shape :math:`(N, B)`; ``None``: no distortion.
-        lens: term that the known distortion of undistorted pixels adds to the Jacobian's column of log f, times z/f,
-            shape :math:`(2, N, B)`; ``None``: 0.
+        lens: if the pixels were undistorted with a known lens, the Jacobian's column of log f has one more term. This
+            is the term times z/f, shape :math:`(2, N, B)`; ``None``: the term is 0.
     """
 
     residual: Tensor

@@ -81,7 +81,9 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     middle = functional.normalize(torch.where(opposite, across, a + b), dim=-1)
     rotation = 2.0 * middle[..., :, None] * middle[..., None, :] - eye
     precision = torch.as_tensor(sigma, dtype=b.dtype, device=b.device).expand(b.shape[:-1]).square().reciprocal()
-    known = precision[..., None, None] * (eye - b[..., :, None] * b[..., None, :])
+    # I - b b^T as a product. If b is almost parallel to an axis, rounding makes the difference indefinite.
+    turned = torch.linalg.cross(b[..., None, :], eye.expand(*b.shape, 3))
+    known = precision[..., None, None] * (turned @ turned.mT)
     information = functional.pad(known, (0, 3, 0, 3))
     return PosePrior(Pose(rotation, torch.zeros_like(b)), information)
 
