@@ -159,9 +159,9 @@ class Pose(NamedTuple):
 
 
 def camera_matrices(intrinsics: Tensor | PinholeCamera, size: torch.Size | None = None) -> Tensor:
-    """Camera matrices (*, 3, 3) or (3, 3) of ``intrinsics``. The extrinsics of Kornia's cameras are ignored.
+    """Camera matrices (B, 3, 3) or (3, 3) of ``intrinsics``. The extrinsics of Kornia's cameras are ignored.
 
-    Kornia's cameras have one batch dimension. This dimension is split into ``size`` if the numbers of cameras agree.
+    Kornia's cameras have one batch dimension. If the number of cameras fits ``size``, it is split into ``size``.
     """
     if not isinstance(intrinsics, PinholeCamera):
         return intrinsics
