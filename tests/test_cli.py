@@ -178,7 +178,8 @@ def test_no_pose_is_exit_code_one_with_the_reason(tmp_path):
         ("\nX,Z,v\n1,2,3\n", ":2: expected the header X,Y,Z,u,v, each once, found 'X,Z,v'"),
         (f"X,{HEADER}{GOOD}", ":1: expected the header"),
         (HEADER + GOOD + "1,2,3,4,5,6\n" + GOOD, ":3: 6 values"),
-        (HEADER + "\n" + GOOD + "1,2,x,4,5\n", ":4: Z must be a finite number, got 'x'"),
+        (HEADER + GOOD + GOOD + "1,2,x,4,5\n", ":4: Z must be a finite number, got 'x'"),
+        (HEADER + "\n" + GOOD + "1,2,,4,5\n", ":4: Z must be a finite number, got ''"),
         (HEADER + "1,2,3,nan,5\n" + GOOD, ":2: u must be a finite number, got 'nan'"),
         ("X,Y,Z,u,v,weight\n1,2,3,4,5,-1\n", ":2: weight must be a number of at least 0, got '-1'"),
         (HEADER + GOOD * 2, ": a pose needs at least 3 correspondences, got 2"),
@@ -206,6 +207,7 @@ def test_bad_npz_files(tmp_path, monkeypatch):
         ({"world_points": np.ones((0, 3)), "img_points": np.ones((0, 2))}, "at least 3 correspondences, got 0"),
         ({"img_points": np.array([[0, 0], [1, 1], [0, math.nan], [2, 2]])}, "img_points[2] must be finite"),
         ({"weights": np.array([1, 1, -2.0, 1])}, "weights[2] must be finite and at least 0"),
+        ({"intrinsics": np.diag([1.0, 0.0, 1.0])}, "focal lengths must not be 0, got 1 and 0"),
         ({"intrinsics": np.eye(3) + np.eye(3, k=-1)}, "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"),
         ({}, "--intrinsics"),
     ):

@@ -285,7 +285,7 @@ def test_any_camera_is_undistorted(camera, pycolmap):
         assert undistort(camera, torch.tensor([[1200.0, 240.0]]))[1].isnan().all()
 
 
-@pytest.mark.parametrize("camera", ["FOO,6,4,5", "PINHOLE,a,b", "", "PINHOLE,inf,4,8,8,3,2", "FOV,6,4,8,8,3,2,nan"])
+@pytest.mark.parametrize("camera", ["F", "PINHOLE,6,4,5", "FOV,a", "", "PINHOLE,inf,4,8,8,3,2", "FOV,6,4,8,8,3,2,nan"])
 @pytest.mark.usefixtures("pycolmap")
 def test_other_cameras_are_refused(camera):
     with pytest.raises(ValueError, match="MODEL,width,height"):

@@ -101,8 +101,7 @@ def test_distances_have_their_closed_forms_and_bounded_gradients(angle, random_r
 
 def test_the_total_is_the_weighted_sum_with_the_ramp(make_problems, perturb, random_rotations):
     p = make_problems()
-    init = perturb(p.pose, angle=0.3, shift=2.0)
-    shift = torch.tensor([0.3, 0.0, -0.4], dtype=torch.float64)
+    init, shift = perturb(p.pose, angle=0.3, shift=2.0), torch.tensor([0.3, 0.0, -0.4], dtype=torch.float64)
     refined = Pose(random_rotations(7, angle=0.1) @ p.pose.rotation, p.pose.translation + shift)
     loss = PoseLoss(rotation=2.0, translation=0.3, init_translation=0.07, refined=5.0)
     for ramp in (0.0, 0.25, 1.0):
@@ -295,8 +294,7 @@ def test_gradient_from_nothing(dtype, size):
 
 
 def test_padding_does_not_change_the_likelihood():
-    p = problems(n=20)
-    mask = torch.arange(20).expand(4, 20) < 16
+    p, mask = problems(n=20), torch.arange(20).expand(4, 20) < 16
     shorter = loss_of(p._replace(world_points=p.world_points[:, :16], img_points=p.img_points[:, :16]), img_sigma=2.0)
     world = p.world_points.masked_fill(~mask[..., None], torch.nan).requires_grad_()
     padded = loss_of(p._replace(world_points=world), img_sigma=torch.where(mask, 2.0, -1.0), mask=mask)

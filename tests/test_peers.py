@@ -52,8 +52,7 @@ def test_outliers_are_rejected(name, make_problems):
 
 @pytest.mark.parametrize("name", PEERS)
 def test_cost_is_the_mean_squared_error_truncated_at_the_threshold(name, make_problems):
-    problems = make_problems(batch=20, outliers=1)
-    solver = make(name)
+    problems, solver = make_problems(batch=20, outliers=1), make(name)
     result = solver(*problems[:3])
     squared = reprojection_errors(problems, result.pose).square().sum(-1).clamp(max=solver.threshold**2)
     seen = problems._replace(pose=result.pose).true_cam_points[..., 2] > 0

@@ -1,6 +1,7 @@
 """Our solvers on the cases of other libraries' public test suites, beside those libraries, and on wild pairs.
 
-Problems are drawn from a suite's parameters. Each of our solvers solves as many as the best peer, minus a margin.
+Problems are drawn from the parameters of the suites. The success of each of our solvers must not be lower than that of
+the best library by more than a margin.
 """
 
 import math

@@ -233,8 +233,7 @@ def test_neighbours_of_inliers_agree(generator):
 
 @pytest.mark.parametrize(("pairs", "size"), [(3, 3), (9, 7), (12, 4)])
 def test_enumeration_has_every_subset_once(pairs, size):
-    samples = Samples(torch.ones(2, pairs), size=size, most=1000, seed=0)
-    total = math.comb(pairs, size)
+    samples, total = Samples(torch.ones(2, pairs), size=size, most=1000, seed=0), math.comb(pairs, size)
     assert samples.totals.tolist() == [total, total]
     positions = samples.positions(torch.tensor([1, 0]), 0, total)
     assert sorted(map(tuple, positions[0].tolist())) == list(itertools.combinations(range(pairs), size))

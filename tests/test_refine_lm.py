@@ -115,8 +115,7 @@ def test_points_behind_the_camera_never_lower_the_cost(kernel, make_problems):
 def test_integer_weights_equal_repeating(kernel, update, make_problems, perturb):
     """Zero equals removing. The cost is a mean over pairs: 6 of them with weights, 9 when repeated."""
     p, times = make_problems(7, outliers=1), torch.tensor([1, 3, 1, 0, 2, 1, 1])
-    start = perturb(p.pose, angle=0.01, shift=0.1)
-    lm = solver(3, kernel=kernel, update=update)
+    start, lm = perturb(p.pose, angle=0.01, shift=0.1), solver(3, kernel=kernel, update=update)
     world, img = (x.repeat_interleave(times, 1) for x in p[:2])
     expected = lm(world, img, p.intrinsics, init=start)
     found = lm(*p[:3], times.double().expand(7, 7), init=start)

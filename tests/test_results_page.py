@@ -389,8 +389,7 @@ def test_cost_of_linear_algebra(function, shapes, expected):
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_costs_of_factorisations_are_those_of_the_loops_of_the_textbook(n):
-    eliminate = sum((n - k - 1) ** 2 for k in range(n))
-    pairs = n * (n - 1) // 2
+    eliminate, pairs = sum((n - k - 1) ** 2 for k in range(n)), n * (n - 1) // 2
     triangular = flops(add=2 * pairs, multiply=2 * pairs, divide=n)
     assert operations.solve(n, 1) == flops(add=eliminate, multiply=eliminate, divide=pairs, compare=pairs) + triangular
     inner = sum(j for j in range(n) for _ in range(j, n))  # Cholesky by columns
