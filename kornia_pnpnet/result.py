@@ -34,7 +34,7 @@ from kornia_pnpnet.core.checks import (
     check_tensors,
     common_dtype,
 )
-from kornia_pnpnet.core.linalg import gate, nearest_rotation, up_to_scale
+from kornia_pnpnet.core.linalg import gate, nearest_rotation, relative
 from kornia_pnpnet.core.performance import full_precision, sees_values
 from kornia_pnpnet.core.trees import map_tensors
 
@@ -95,8 +95,11 @@ class Pose(NamedTuple):
             quaternion: quaternion of any finite length, shape :math:`(B, 4)`. The length 0 gives the identity.
             translation: shape :math:`(B, 3)`.
         """
-        rotate = quaternion_to_rotation_matrix
-        return cls._of_vectors(lambda x: rotate(up_to_scale(x)), "quaternion", quaternion, 4, translation)
+
+        def rotate(x: Tensor) -> Tensor:  # no square of a relative length overflows or underflows
+            return quaternion_to_rotation_matrix(relative(x, x.detach().abs()))
+
+        return cls._of_vectors(rotate, "quaternion", quaternion, 4, translation)
 
     @classmethod
     def _of_vectors(

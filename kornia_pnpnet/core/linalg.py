@@ -76,18 +76,9 @@ def lengths(vectors: Tensor) -> Tensor:
     return unit[..., 0] * ((vectors / unit).square().sum(-1) + limits.tiny).sqrt()
 
 
-def up_to_scale(vectors: Tensor) -> Tensor:
-    """Divide vectors (*, K) by their largest entry, so that no square over- or underflows. The vector 0 stays 0.
-
-    The divisor has no gradient. The gradient of a function of the direction is nevertheless exact.
-    """
-    largest = vectors.detach().abs().amax(-1, keepdim=True)
-    return vectors / torch.where(largest > 0, largest, 1.0)
-
-
 def relative(values: Tensor, size: Tensor) -> Tensor:
-    """Divide values (B, N) by the largest ``size`` of their problem, or by 1 if this largest size is 0."""
-    largest = size.amax(1, keepdim=True)
+    """Divide values (*, N) by the largest ``size`` of the last dimension, or by 1 if this largest size is 0."""
+    largest = size.amax(-1, keepdim=True)
     return values / torch.where(largest > 0, largest, 1.0)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_form, check_positive, check_shapes, common_dtype
-from kornia_pnpnet.core.linalg import up_to_scale
+from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import compiling, full_precision
 from kornia_pnpnet.problem import Linear, State
 from kornia_pnpnet.refine.residual import NormalEquations, tangent
@@ -71,7 +71,8 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     tensors = {"world_down": world_down, **{name: x for name, (x, _) in shapes.items()}}
     check_devices(tensors, world_down, "world_down")
     dtype = common_dtype(tensors)
-    a, b = (functional.normalize(up_to_scale(x.to(dtype)), dim=-1) for x in (world_down, cam_down))
+    directions = (relative(x.to(dtype), x.to(dtype).detach().abs()) for x in (world_down, cam_down))
+    a, b = (functional.normalize(x, dim=-1) for x in directions)
     eye = torch.eye(3, dtype=b.dtype, device=b.device)
     # The rotation is half a turn about the bisector of both directions. For opposite directions, which have no
     # bisector, the rotation is half a turn about a perpendicular axis.
