@@ -77,7 +77,6 @@ EXPORTS = [
     ("program", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
     ("onnx", "pnpnet-n9", None, None, ((9, 1), (9, 3), (9, 100)), False),
     ("onnx", "pnpnet-set", None, None, ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)), False),
-    ("onnx", "identity-lm", 9, 4, ((9, 4),), False),
     ("onnx", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
     ("package", "identity-lm", 9, 1, ((9, 1),), False),
     ("package", "identity-lm", 9, None, ((9, 1), (9, 3), (9, 100)), False),
@@ -91,7 +90,7 @@ EXPORTS = [
 @pytest.mark.parametrize(
     ("kind", "name", "n", "batch", "sizes", "is_rig"),
     [
-        ("onnx", "identity-lm", 9, None, ((9, 4),), False),
+        *(("onnx", "identity-lm", 9, batch, ((9, 4),), False) for batch in (4, None)),
         *(pytest.param(*export, marks=pytest.mark.slow) for export in EXPORTS),
     ],
 )
