@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from kornia_pnpnet.core.files import digest, write_json
 from kornia_pnpnet.core.schema import to_json
+from kornia_pnpnet.evaluation.results import differences
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training import TrainingError, fit
 from kornia_pnpnet.training.card import write_model_card
@@ -59,7 +60,10 @@ def main(config: DictConfig) -> float | None:
             origin = find_results(config.weights)
         except (FileNotFoundError, RuntimeError, ValueError, ValueCheckError) as error:
             reason = " ".join(str(error).split())[:300]
-            sys.exit(f"Cannot start n = {config.model.n} from weights={config.weights}: {reason}")
+            message = f"Cannot start n = {config.model.n} from weights={config.weights}: {reason}"
+            if sweeps:  # the sweep continues with its next run
+                raise TrainingError(message) from error
+            sys.exit(message)
         start = digest(*model.state_dict().values())  # files of weights may have another path on another machine
     if config.compile:
         model.compile()
@@ -134,7 +138,18 @@ def continuing(*more: str) -> str:
 
 
 def start_from(model: PnPNet, trained: PnPNet) -> None:
-    """Copy the weights of another solver. If ``m`` or the form of the refinement differs, ``model`` keeps its own."""
+    """Copy the weights of another solver. If ``m`` or the form of the refinement differs, ``model`` keeps its own.
+
+    Raises:
+        ValueError: when the network of ``trained`` gets its inputs in other units or another order.
+    """
+
+    def inputs(solver: PnPNet) -> dict[str, Any]:
+        network: Any = getattr(solver.init, "config", {})
+        return {**solver.normalize.config, **{x: network[x] for x in ("world_scale", "img_scale") if x in network}}
+
+    if found := differences(inputs(trained), inputs(model)):
+        raise ValueError("the inputs of the networks differ: " + "; ".join(found))
     state = trained.state_dict()
     kind = {key: trained.refine.config[key] for key in ("m", "kernel", "shared", "by_residual")}
     if not kind.items() <= model.refine.config.items():

@@ -10,6 +10,7 @@ from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import So3
 from torch import Tensor
+from torch.nn.functional import pad
 
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.cameras import zoomed
@@ -165,11 +166,12 @@ def pose_covariance(
 
     # Convert to the caller's world: omega stays the same, and v = size * v_framed + (R centroid) x omega.
     rotated_centroid = (pose.rotation @ frame.centroid[..., None])[..., 0]
-    back = eye.repeat(len(matrix), 1, 1)
-    back[:, 3:6, :3] = So3.hat(rotated_centroid)
-    back[:, 3:6, 3:6] *= frame.size[:, None, None]
+    shift = torch.cat((So3.hat(rotated_centroid), frame.size[:, None, None] * eye[:3, :3]), -1)
     if size_of_camera:  # the depth of the centroid grows with the focal length, see `refine.residual.moved`
-        back[:, 5, 6] = pose.translation[:, 2] + rotated_centroid[:, 2]
+        depth = pose.translation[:, 2] + rotated_centroid[:, 2]
+        shift = torch.cat((shift, depth[:, None, None] * eye[2:3, :3].mT), -1)
+    first, last = (eye[rows].expand(len(matrix), -1, -1) for rows in (slice(3), slice(6, None)))
+    back = torch.cat((first, pad(shift, (0, len(eye) - shift.shape[-1])), last), 1)
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
     covariance = torch.where(determined, covariance, eye.masked_fill(eye > 0, torch.inf))
     return restore_leading(size, covariance.to(dtype))

@@ -169,7 +169,7 @@ def monte_carlo_pose_loss(
             damping=_MODE_DAMPING,
             reject_worse=False,
             learnable=False,
-        ).to(points)
+        )
     model = _Posterior(problem, _Prior(poses[0].translation), refine, points.new_tensor(scale), noisy_points)
     with torch.no_grad():
         drawn, log_proposal = _draw(model._replace(problem=problem.map(Tensor.detach)), poses, samples // count, rounds)

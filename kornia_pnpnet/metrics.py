@@ -66,7 +66,8 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         ranges: number of bins, :math:`K`.
 
     Raises:
-        ValueCheckError: when the shapes differ or the tensors are empty.
+        ValueCheckError: when the shapes differ, the tensors are empty, a chance is not between 0 and 1, or ``outcomes``
+            is not bool.
         BaseError: when ``ranges`` is not an integer of at least 1, or the tensors are on different devices.
 
     Example:
@@ -80,6 +81,8 @@ def reliability(chances: Tensor, outcomes: Tensor, ranges: int = 10) -> Reliabil
         raise ValueCheckError(f"chances and outcomes must have the same shape and at least one element, got {shapes}.")
     check_whole(1, ranges=ranges)
     check_devices({"outcomes": outcomes}, chances, "chances")
+    if outcomes.dtype != torch.bool or not bool(((chances >= 0) & (chances <= 1)).all()):
+        raise ValueCheckError("chances must be between 0 and 1, and outcomes must be bool.")
     chance, outcome = (x.detach().flatten().to(torch.float64) for x in (chances, outcomes))
     bins = (chance * ranges).long().clamp(0, ranges - 1)
     number, predicted, observed = (

@@ -128,9 +128,14 @@ class PretrainedMixin(nn.Module):
 
     @classmethod
     def option_names(cls) -> list[str]:
-        """Names of the options, which are the keyword-only arguments of the constructor."""
-        parameters = inspect.signature(cls.__init__).parameters.values()
-        return [x.name for x in parameters if x.kind is inspect.Parameter.KEYWORD_ONLY]
+        """Names of the options: keyword-only arguments of the constructor, and those it passes on in ``**kwargs``."""
+        names: dict[str, None] = {}
+        for base in (x for x in cls.__mro__ if "__init__" in vars(x)):
+            parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
+            names |= {x.name: None for x in parameters if x.kind is inspect.Parameter.KEYWORD_ONLY}
+            if all(x.kind is not inspect.Parameter.VAR_KEYWORD for x in parameters):
+                break
+        return list(names)
 
     @property
     def options(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any, Literal, TypeAlias, overload
 
@@ -142,8 +143,13 @@ def create_solver(name: str, **options: Any) -> nn.Module:
 
 @lru_cache(maxsize=8)
 def _on_device(name: str, device: torch.device) -> nn.Module:
-    with torch.inference_mode(False), device:  # the parameters must also serve calls that record gradients
-        return create_solver(name)
+    def create() -> nn.Module:
+        with device:
+            return create_solver(name)
+
+    # The parameters must also serve other calls. A new thread is outside of inference mode and of `torch.func`.
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(create).result()
 
 
 def solve_pnp(

@@ -297,12 +297,16 @@ class PnPNet(PretrainedMixin):
         lens. The ``ok`` of the starts says whether the problem is valid.
         """
         size, inputs = checked_inputs(*args, **options)
-        self._is_rig(inputs, options.get("dist"), options.get("fisheye"))
+        rig = self._is_rig(inputs, options.get("dist"), options.get("fisheye"))
         with in_full_precision(inputs.world_points.device.type):
             call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always")
             inputs, nominal = self._with_camera(inputs)
             attempt = self._attempt(inputs, call, nominal=nominal)
-            return restore_leading(size, (attempt.result, attempt.frame.undo_starts(attempt.starts)))
+            result, starts = restore_leading(size, (attempt.result, attempt.frame.undo_starts(attempt.starts)))
+            if rig:
+                intrinsics = args[2] if len(args) > 2 else options["intrinsics"]
+                result = result._replace(intrinsics=given_cameras(intrinsics, size, result.translation))
+            return result, starts
 
     def _is_rig(self, inputs: Inputs, dist: Tensor | None, fisheye: Tensor | None, alternatives: int = 0) -> bool:
         """Refuse arguments that exclude each other, and tell whether the problems are rigs."""

@@ -238,6 +238,7 @@ def test_rigs(name, cameras, outlier_share, options, base):
     result = create_solver(name, **options)(*p[:3], **p.known)
     assert right(result, p.pose, 0.05, 0.01).double().mean() > 0.95
     torch.testing.assert_close(result.intrinsics, p.intrinsics)
+    assert torch.equal(create_solver(name, **options).with_starts(*p[:3], **p.known)[0].intrinsics, p.intrinsics)
 
 
 def test_what_cannot_be_combined_is_refused():

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, pose_errors, success, success_rate
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, pose_errors, success, success_rate
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -114,6 +114,10 @@ def test_a_pose_that_is_not_finite_is_a_failure():
     for row in broken:
         assert row["ok"] == [0] + 99 * [1]
         assert row["translation_error"] == whole["translation_error"]
+    here = Pose(torch.eye(3).expand(100, 3, 3), torch.zeros(100, 3))  # where solvers are that find no pose
+    noise = CLEAN["clean"].problems._replace(img_points=3000.0 * torch.rand(100, 9, 2), pose=here)
+    (row,) = evaluate({"epnp-lm": create_solver("epnp-lm")}, {"noise": EvaluationData(noise)})["rows"]
+    assert row["success"]["rate"] == row["ok"] == 0.0
 
 
 def test_fewer_problems_are_the_first_of_more():

@@ -172,6 +172,8 @@ def test_weights_are_inverse_variances_by_the_jacobian(make_problems):
     weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(problems).weights
     given = problems._replace(img_sigma=weights.new_tensor([2, 2, torch.nan]), world_sigma=0.3 * weights.new_ones(3, 9))
     assert_same(KnownInliersAndNoise(img_sigma=2.0).solve_with_truth(given).weights, weights)  # NaN: unknown
+    same = problems._replace(intrinsics=10.0 * problems.intrinsics)  # one camera
+    assert_same(KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(same).weights, weights, rtol=1e-9)
     exact = problems._replace(img_sigma=weights.new_zeros(3), world_sigma=weights.new_zeros(3))
     assert KnownInliersAndNoise().solve_with_truth(exact).ok.all()
 

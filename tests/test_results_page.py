@@ -268,7 +268,7 @@ def test_no_results_file_is_older_than_one_change_of_behaviour():
     assert {"solvers.json", "paper.json", "gpu.json"} <= made.keys()
     for name in ("keypoint_pipeline", "keypoint_covariances"):
         made.pop(f"{name}.json")  # ways to train one network, compared within one run
-    late = {"gpu.json": 4}  # no GPU was at hand after change 1
+    late = {"gpu.json": 5}  # no GPU was at hand after change 1
     assert [name for name, x in made.items() if BEHAVIOUR - x.get("behaviour", 0) > late.get(name, 1)] == []
 
 

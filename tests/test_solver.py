@@ -50,6 +50,9 @@ def test_effort_is_adaptive_in_inference_and_fixed_in_training_and_in_graphs():
     inputs = SyntheticProblems(n=20, batch_size=3, seed=1).batch(0)[:3]
     mapped = torch.func.vmap(lambda *x: solvers[1](*x).translation)(*inputs)
     assert torch.allclose(mapped, solvers[0](*inputs).translation, rtol=1e-4, atol=1e-4)
+    spread = solvers[0](*inputs).covariance(*inputs, img_sigma=np.float32(1.0))
+    mapped = torch.func.vmap(lambda *x: solvers[0](*x).covariance(*x, img_sigma=1.0))(*inputs)
+    torch.testing.assert_close(mapped, spread, rtol=1e-2, atol=0.0)
     assert PnPNet(k.SetInit(starts=1, samples=0)).eval()(*inputs).ok.all()
 
 
@@ -242,6 +245,11 @@ def saved_net():
     return solver
 
 
+class PassesOn(PnPNet):
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+
+
 @pytest.mark.parametrize(
     "solver",
     [
@@ -249,6 +257,7 @@ def saved_net():
         lambda: PnPNet(None, RobustWeightedLM(m=2, step=np.float32(0.9)), gradient="always"),
         lambda: create_solver("epnp-lm", m=2, focal="unknown", focal_sigma=np.float32(0.1), radial=1),
         lambda: create_solver("pnpnet-set", effort="fixed", views=2),
+        lambda: PassesOn(None, focal="unknown").with_options(views=1),
     ],
 )
 def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, make_problems):

@@ -124,7 +124,8 @@ def test_run_starts_from_weights(tmp_path, train):
     assert PnPNet.from_pretrained(tmp_path / "mine").config() == weights.config()
     (tmp_path / "mine" / "results.json").write_text('{"overrides": [1]}')
     damaged = f"weights={tmp_path / 'mine'}", r"is not a results file of a run: overrides\[0\] is 1"
-    for wrong, why in (("model.n=6", ""), ("weights=nowhere", ""), damaged):
+    centre = "model.solver.normalize.center=false", "inputs of the networks differ: center"
+    for wrong, why in (("model.n=6", ""), ("weights=nowhere", ""), centre, damaged):
         with pytest.raises(SystemExit, match=f"Cannot start.*{why}"):
             train(f"hydra.run.dir={tmp_path}/wrong", *options, wrong)
     assert not (tmp_path / "wrong" / "last.ckpt").exists()

@@ -197,15 +197,26 @@ def test_train_briefly(tmp_path):
     assert float(rows[-1]["val/none/success"]) > float(rows[0]["val/none/success"])
 
 
+class Uneven(SyntheticProblems):
+    def batch(self, index):
+        return super().batch(index).map(lambda x: x[: (1, 5, 16)[index % 3]])
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
-def test_two_processes_equal_one(tmp_path):
+@pytest.mark.parametrize("source", [SyntheticProblems, Uneven])
+def test_two_processes_equal_one(source, tmp_path):
     """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
-    one = {**make_parts(dtype=torch.float64), "validation": {}}
+
+    def parts():
+        data = source(n=6, batch_size=16, seed=3, outliers=OutlierMix(), dtype=torch.float64)
+        return {**make_parts(dtype=torch.float64), "validation": {}, "data": data}
+
+    one = parts()
     start = deepcopy(one["model"].state_dict())
     fit(folder=tmp_path / "one", **one)
 
     def train(fabric):
-        fit(folder=tmp_path, fabric=fabric, **{**make_parts(dtype=torch.float64), "validation": {}})
+        fit(folder=tmp_path, fabric=fabric, **parts())
 
     Fabric(accelerator="cpu", devices=2, strategy="ddp_fork").launch(train)
     two = torch.load(tmp_path / CHECKPOINT_NAME, weights_only=True)["model"]

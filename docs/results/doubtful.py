@@ -64,13 +64,13 @@ def doubtful(count: int, seed: int) -> Iterator[Kind]:
         yield Kind(f"{pairs} pairs, y up", points, flipped, None, {})
         yield Kind(f"{pairs} pairs, left-handed world", points * torch.tensor([1.0, 1.0, -1.0]), pixels, None, {})
         yield Kind(f"{pairs} pairs, row and column", points, pixels.flip(-1), None, {})
-    for wrong in (0, 3, 10):
-        line = torch.linspace(-1.0, 1.0, 30)[:, None] * normalize(normal(1, 3), dim=-1)
+    for pairs, wrong in ((30, 0), (30, 3), (30, 10), (8, 1)):
+        line = torch.linspace(-1.0, 1.0, pairs)[:, None] * normalize(normal(1, 3), dim=-1)
         points, truth = torch.cat((line, 0.8 * normal(wrong, 3)), 1), pose(5.0)
         pixels = seen(points, truth, 0.5)
-        pixels[:, 30:] = anywhere(wrong)
+        pixels[:, pairs:] = anywhere(wrong)
         given = {"img_sigma": 0.5, "world_sigma": 0.0}
-        yield Kind(f"30 pairs on a line, {wrong} outliers", points, pixels, truth, given)
+        yield Kind(f"{pairs} pairs on a line, {wrong} outliers", points, pixels, truth, given)
     corners = 0.5 * EDGE * torch.tensor([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
     for size, sigma in ((20, 0.3), (60, 1.0), (60, 0.3), (100, 0.3), (400, 0.5)):
         turn = 0.6 * normal(3) * torch.tensor([1.0, 1.0, 0.0])

@@ -40,21 +40,20 @@ ARGUMENTS = ("world_points", "img_points", "intrinsics")
 
 @torch.no_grad()
 def measure_probability(seed_fit: int, seed_report: int) -> dict[str, Any]:
-    """Fit the law on problems of one seed, and measure it on those of another.
+    """Fit a law on problems of one seed, and measure the law of the package on those of another.
 
     The problems are like real matches (``conf/data/matches.yaml``), of 5 to 150 pairs, those of the protocol, and those
-    of ``doubtful.py``. Returns the law, and by solver and kind the share of right and of far-off poses that are ``ok``,
-    and the reliability.
+    of ``doubtful.py``. Returns both laws, and by solver and kind the shares of right and of far-off poses that are
+    ``ok``, and the reliability.
     """
     law = fit_law([solved(name, kind) for name in FITTED for kind in kinds(seed_fit) if in_fit(kind.name)])
-    made: dict[str, Any] = {"environment": environment(), "law": law}
-    with mock.patch.object(evidence, "LAW", law):
-        for name in (*FITTED, *MEASURED):
-            rows = {kind.name: solved(name, kind) for kind in kinds(seed_report)}
-            fitted = [row for kind, row in rows.items() if in_fit(kind)]
-            chance, near = (torch.cat([row[key] for row in fitted]) for key in ("probability", "near"))
-            curve = {key: x.nan_to_num(0.0).tolist() for key, x in reliability(chance, near)._asdict().items()}
-            made[name] = {"kinds": {kind: rates(row) for kind, row in rows.items()}, "reliability": curve}
+    made: dict[str, Any] = {"environment": environment(), "law": list(evidence.LAW), "fitted": law}
+    for name in (*FITTED, *MEASURED):
+        rows = {kind.name: solved(name, kind) for kind in kinds(seed_report)}
+        fitted = [row for kind, row in rows.items() if in_fit(kind)]
+        chance, near = (torch.cat([row[key] for row in fitted]) for key in ("probability", "near"))
+        curve = {key: x.nan_to_num(0.0).tolist() for key, x in reliability(chance, near)._asdict().items()}
+        made[name] = {"kinds": {kind: rates(row) for kind, row in rows.items()}, "reliability": curve}
     return made
 
 

@@ -111,8 +111,8 @@ def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) 
     ``sigma`` is a number or has the shape (), (*) or (*, N). ``None`` becomes NaN. Error messages use ``name``.
     """
     pairs = world_points.shape[:-1]
-    if sigma is None or isinstance(sigma, int | float):
-        return world_points.new_full(pairs, torch.nan if sigma is None else sigma)
+    if sigma is None or isinstance(sigma, Real):
+        return world_points.new_full(pairs, torch.nan if sigma is None else float(sigma))
     if not isinstance(sigma, Tensor):
         raise TypeCheckError(f"{name} must be a number or a tensor, got {type(sigma).__name__}.")
     check_devices({name: sigma}, world_points)

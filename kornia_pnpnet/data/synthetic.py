@@ -135,6 +135,8 @@ class SyntheticProblems(RandomProblems):
                 check_ranges(**{name: value})
             for end in value if isinstance(value, Sequence) else [value]:
                 check_numbers(low if end else 0.0, high, **{name: end})
+        near = self.outliers is not None and self.outliers.near_share > 0.0 and self.outliers.near_pixels is None
+        KORNIA_CHECK(not near or self.img_sigma != 0.0, "near outliers of exact pixels need near_pixels.")
         KORNIA_CHECK(
             self.axis_ratio == 1.0 or self.known_noise in (0.0, 1.0),
             f"known_noise must be 0 or 1 if axis_ratio is above 1, got known_noise={self.known_noise}.",

@@ -79,7 +79,8 @@ class KnownInliersAndNoise(Configured):
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # the solver ignores points behind the camera
-        focal = problems.pair_intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
+        camera = problems.pair_intrinsics
+        focal = (camera / camera[..., 2:, 2:]).diagonal(dim1=-2, dim2=-1)[..., :2]
         # J_x = (f / z) [1, 0, -p; 0, 1, -q] R with p = x / z and q = y / z. The rotation cancels in the trace.
         trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
         img_sigma = img_sigma.maximum(LEAST_NOISE * focal.abs().amax(-1))

@@ -21,11 +21,13 @@ from kornia_pnpnet.core.trees import iter_tensors, map_tensors, take
 from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, row_errors, save_results, source_digest
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
-from kornia_pnpnet.result import PnPResult, Problems, gate_pose
+from kornia_pnpnet.result import PnPResult, Pose, Problems, gate_pose
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
 
+# Rotation in place of a missing pose: half a turn about the axis (1, 2, 3), which no true pose is expected to be.
+_NO_ROTATION = ((-6 / 7, 2 / 7, 3 / 7), (2 / 7, -3 / 7, 6 / 7), (3 / 7, 6 / 7, 2 / 7))
 _QUARTILES = {"q25": 0.25, "median": 0.5, "q75": 0.75}
 # Entries of the environment that may differ between the rows of a results file. Versions of packages must be equal.
 _MACHINE = ("python", "platform", "cpu", "threads", "gpu", "commit")
@@ -196,7 +198,12 @@ def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int)
     pose, ok = map_tensors(lambda *parts: torch.cat(parts), *found)
     pose, truth = map_tensors(lambda part: part.double().cpu(), (pose, problems.pose))
     finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
-    errors, ok = pose_errors(gate_pose(pose, finite, finite), truth), ok.cpu() & finite
+    ok = ok.cpu() & finite
+    pose = gate_pose(pose, finite, finite)
+    # Solvers return the identity if they find no pose. This must not be a success where the true pose is the identity.
+    none = ~ok & (pose.matrix == torch.eye(4, dtype=torch.float64)).flatten(1).all(-1)
+    rotation = torch.where(none[:, None, None], pose.rotation.new_tensor(_NO_ROTATION), pose.rotation)
+    errors = pose_errors(Pose(rotation, pose.translation), truth)
 
     lists = {name: values.tolist() for name, values in errors._asdict().items()}
     per_problem = _rounded({**lists, "ok": ok.int().tolist()})

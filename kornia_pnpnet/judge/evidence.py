@@ -79,7 +79,8 @@ _KEY = math.pi / 4
 #: Least :func:`probability` of a believed pose. A Gaussian error is within two sigmas with about this probability.
 LEAST_PROBABILITY = 0.955
 #: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
-#: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers.
+#: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers,
+#: and fits them again for comparison.
 LAW = (-0.3903, 0.6585, -0.2581)
 # Ranges to which the evidence and the logarithm of `pose_sigma` are clipped in :func:`probability`.
 _EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
@@ -91,9 +92,9 @@ _MOST_NOISE = 0.016
 # A point is off a line if its distance from the line exceeds this multiple of the standard deviation along the line.
 _OFF = 0.05
 # The required number of points off the line is the number of inliers minus this number, but at least 1 and at most 3.
-_FEW = 5
-# Rounds of the robust fit of the line.
-_LINE_ROUNDS = 3
+_FEW = 4
+# Rounds of the robust fit of the line, and the least squared distance of its first weights, relative to the sum.
+_LINE_ROUNDS, _LEAST = 3, 1e-7
 
 
 class Votes(NamedTuple):
@@ -371,20 +372,25 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
     Points on a line leave one rotation free. A few outliers can determine this rotation by chance.
     """
     world, inliers = world_points.permute(2, 1, 0), inliers.mT  # (3, N, B) and (N, B)
-    weights = there = inliers.to(world.dtype)
+    there = inliers.to(world.dtype)
+    number = there.sum(0)
+    # A far point off the line must not turn the first line: in the first round, points count by their direction only.
+    sq_far = (world - (world * there).sum(1, keepdim=True) / number).square().sum(0)
+    weights = there / torch.add(sq_far, (there * sq_far).sum(0), alpha=_LEAST)
     # If no inlier exists, or if all inliers are one point, the numbers are NaN, and the result is False.
     for _ in range(_LINE_ROUNDS):
         share = weights / weights.sum(0)
         centred = world - (share * world).sum(1, keepdim=True)
         matrix = (centred[:, None] * (share * centred)).sum(2)  # (3, 3, B)
         matrix = matrix / matrix.amax((0, 1))
-        # The line follows the first eigenvector. The fourth power of the matrix maps (1, 1, 1) close to this direction.
+        # The line follows the first eigenvector. The longest column of the fourth power is close to this direction.
         matrix = (matrix[:, :, None] * matrix).sum(1)
-        direction = (matrix * matrix.sum(1)).sum(1)
+        longest = matrix.diagonal().argmax(1).expand(1, 3, -1)
+        direction = (matrix * matrix.gather(0, longest)).sum(1, keepdim=True)
         direction = direction / direction.norm(dim=0)
-        along = (direction[:, None] * centred).sum(0)
-        sq_off = torch.addcmul(centred, direction[:, None], along, value=-1.0).square().sum(0)
+        along = (direction * centred).sum(0)
+        sq_off = torch.addcmul(centred, direction, along, value=-1.0).square().sum(0)
         sq_length = (share * along.square()).sum(0)
         weights = there / torch.add(sq_off, sq_length, alpha=_OFF**2)
     off = (inliers & (sq_off > _OFF**2 * sq_length)).sum(0)
-    return off >= (inliers.sum(0) - _FEW).clamp(1, MIN_PAIRS)
+    return off >= (number - _FEW).clamp(1, MIN_PAIRS)

@@ -58,9 +58,6 @@ _WIDER = 16.0
 _FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step. The damping is small, because the start is close to the minimum.
 _DAMPING = 1e-6
-# Factors of the inlier threshold in the first and in the second least-squares step. Inliers have larger residuals at
-# the pose of a minimal sample than at an improved pose.
-_LIMITS = 3.0, 1.0
 # If `pose_sigma` exceeds _OPEN, at least _OPEN_SAMPLES samples are drawn, because an incorrect pose may have as many
 # inliers as the correct pose. An example is a flat scene in a narrow field of view.
 _OPEN, _OPEN_SAMPLES = 0.06, 256.0
@@ -334,11 +331,10 @@ class Search:
         number, pairs = problems.shape[0], self.low.shape[1]
         problems, losses, poses = (full_vectors(x, pairs) for x in (problems, losses, poses))
         scene = take(self.scene, problems)
-        for limit in _LIMITS:
+        for _ in range(2):
             owners = problems.repeat_interleave(poses.shape[2])
             problem, thresholds, projection = self._projected(owners, poses.mT.flatten(0, 1))
-            wide = Thresholds(limit * thresholds.img, limit * thresholds.world)
-            pose, camera = least_squares(problem, projection, judge(projection, problem, wide).weights)
+            pose, camera = least_squares(problem, projection, judge(projection, problem, thresholds).weights)
             entries = as_entries(pose)
             if camera.shape[1]:
                 entries = torch.cat((entries[:, :8], entries[:, 8:] * (-camera).exp()), 1)

@@ -218,7 +218,8 @@ class RobustWeightedLM(Configured):
         self.damping = BoundedParameter(damping, size=size, lower=1e-8, upper=1e2, logarithmic=True)
         bounds = {"lower": self.kernel.lower, "upper": self.kernel.upper}
         self.robustness = BoundedParameter(shape, size=size, **bounds, logarithmic=self.kernel.logarithmic)
-        self.requires_grad_(learnable and m > 0)
+        for parameter in self.parameters():  # `requires_grad_` is forbidden within `torch.func.grad`
+            parameter.requires_grad = learnable and m > 0
 
     @property
     def kernel(self) -> RobustKernel:

@@ -387,8 +387,8 @@ def lm_step(
     # The derivative of the tangent vector with respect to the rotation vector is the left Jacobian of SO(3).
     rvec = rotation_matrix_to_axis_angle(state.pose.rotation)
     size, matrix = len(equations.gradient), equations.matrix.permute(2, 0, 1)
-    tangent = torch.eye(size, dtype=rvec.dtype, device=rvec.device).repeat(rvec.shape[0], 1, 1)
-    tangent[:, :3, :3] = So3.left_jacobian(rvec)
+    eye = torch.eye(size, dtype=rvec.dtype, device=rvec.device)
+    tangent = eye + functional.pad(So3.left_jacobian(rvec) - eye[:3, :3], (0, size - 3, 0, size - 3))
     gradient = (tangent.mT @ equations.gradient.mT[..., None])[..., 0].mT
     delta, solved = solve_positive((tangent.mT @ matrix @ tangent).permute(1, 2, 0), gradient, damping)
     delta = delta * (-step / focal)

@@ -75,7 +75,7 @@ class History:
             with self._path.open(newline="") as file:  # a crash can cut the last row
                 rows = [row for row in csv.DictReader(file) if None not in row.values() and int(row["update"]) <= start]
         write_csv(self._path, columns, rows)
-        self.board = SummaryWriter(folder / "tensorboard", purge_step=start or None)
+        self.board = SummaryWriter(folder / "tensorboard", purge_step=start + 1 if start else None)
 
     def write(self, row: dict[str, float]) -> None:
         """Append a row, which must have the key ``update``."""

@@ -197,7 +197,6 @@ def fit(
     validation = {name: problems.map(lambda x: x.to(fabric.device)) for name, problems in validation.items()}
     columns = [*_COLUMNS, *(f"val/{name}/{column}" for name in validation for column in _CURVES)]
     history = History(Path(folder), columns, start) if fabric.is_global_zero else None
-    part = slice(fabric.global_rank, None, fabric.world_size)  # each process gets a part of every batch
     # Updates with refinement are much slower than earlier updates, so the progress bar restarts when refinement starts.
     alone = min(settings.updates, math.ceil(settings.ramp[0] * settings.updates))
     phase = ("network alone", alone) if start < alone else (_REFINES, settings.updates)
@@ -226,7 +225,7 @@ def fit(
 
     with stop_on_signal() as stop, closing(batches), bar, logging_redirect_tqdm():
         for update, batch in enumerate(batches, start + 1):
-            problems = batch.map(lambda x: x[part].to(fabric.device))
+            problems, share = _own_part(batch, fabric)
             clock.lap("data")
             if update - 1 == bar.total:
                 bar.reset(settings.updates)
@@ -235,7 +234,7 @@ def fit(
             factor, ramp = settings.lr_factor(update - 1), settings.ramp_factor(update - 1)
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
-            terms = _compare(solver, loss, problems, ramp)
+            terms = LossTerms(*(share * x for x in _compare(solver, loss, problems, ramp)))
             # Training on several processes needs a gradient of every parameter. Before the ramp, the loss therefore
             # gets a zero term with the parameters of the refinement.
             unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
@@ -301,6 +300,17 @@ def fit(
         history.board.close()
     model.eval()
     return report(start, dict.fromkeys(_STAGES, 0.0))
+
+
+def _own_part(batch: Problems, fabric: Fabric) -> tuple[Problems, float]:
+    """Take this process's part of a batch. Also return the factor of its mean loss in the mean of all processes.
+
+    Batches of `VaryingSize` cannot always be shared equally. A process without a problem gets one with the factor 0.
+    """
+    own = slice(fabric.global_rank, None, fabric.world_size)
+    number = len(batch.inliers[own])
+    problems = batch.map(lambda x: x[own if number else slice(1)].to(fabric.device))
+    return problems, number * fabric.world_size / len(batch.inliers)
 
 
 def _compare(solver: Any, loss: PoseLoss | SetLoss, problems: Problems, ramp: float) -> LossTerms:
