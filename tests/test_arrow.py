@@ -139,7 +139,6 @@ def test_rows_for_another_network_are_malformed_and_few_rows_are_a_table(draw):
 
 
 def test_any_kind_of_list(draw):
-    """Slices, large, fixed-size and nested lists, other dtypes."""
     _, table = draw()
     expected = numbers(Solve("epnp-lm")(table.slice(2, 3)), "translation")
     for make in (

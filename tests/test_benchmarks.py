@@ -138,7 +138,6 @@ def test_a_solver_that_does_not_compile_is_not_timed_as_compiled(monkeypatch):
 
 @pytest.mark.slow
 def test_throughput_and_latency_have_a_row_for_every_point(tmp_path, monkeypatch):
-    """A small run, in one process instead of many."""
     pytest.importorskip("cv2")
     names = ("refinement", "epnp-lm", "opencv-ransac", "kornia-dlt")
 

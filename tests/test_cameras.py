@@ -65,7 +65,6 @@ def test_undistorted_pixels_are_distorted_back_and_kornias(number, uniform):
 
 
 def test_fisheyes_agree_with_opencv(uniform):
-    """Pixels in the plane, and directions beyond it."""
     _, pixels, _ = seen(uniform, 1, 50)
     plane = transform_points(torch.linalg.inv(CAMERA), pixels).reshape(-1, 1, 2).numpy()
     seen_pixels = torch.from_numpy(cv2.fisheye.distortPoints(plane, CAMERA.numpy(), FISHEYE.numpy())).view(1, 50, 2)

@@ -36,7 +36,6 @@ def tangent(estimate, truth):
 
 
 def test_zero_weight_equals_removing(make_problems):
-    """Such pairs may hold any numbers."""
     p = make_problems(n=12, batch=5)
     weights = (torch.arange(12) < 8).double().expand(5, 12)
     world, sigma = p.world_points.clone(), torch.full((5, 12), 2.0, dtype=DOUBLE)
@@ -61,7 +60,6 @@ def test_units_of_the_noise(make_problems):
 
 @pytest.mark.parametrize(("camera", "noise"), [("pixels", "covariance"), *product(CAMERAS, ("sigma",))])
 def test_an_undetermined_pose_has_infinite_variances_and_no_gradient(camera, noise):
-    """And changes no other covariance."""
     case = Case("epnp-lm", camera, noise)
     kinds, sound, bad = make_bad(case)
     _, pose = make(case, len(sound["weights"]))
@@ -313,7 +311,6 @@ def test_gradients_of_points(seen):
 
 
 def test_missing_depth_is_nan_and_can_be_masked(seen):
-    """Pairs without depth fail their problem, unless they are masked."""
     _, pose, pixels, depth = seen
     depth = depth.clone()
     depth[0, 1], depth[0, 2], depth[0, 3] = 0.0, torch.nan, torch.inf

@@ -129,7 +129,6 @@ def printed(tmp_path, name, *arguments):
 
 
 def test_your_data_are_evaluated_with_and_without_padding_and_poselib(tmp_path, monkeypatch):
-    """Without PoseLib one line says what is missing."""
     (tmp_path / "poselib.py").write_text("raise ImportError")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
     shown = printed(tmp_path, "evaluate_your_data")
@@ -271,7 +270,6 @@ def test_the_tables_of_the_page_are_of_the_results():
 
 
 def test_keypoints_are_visible_where_nothing_is_before_them():
-    """The box alone: what shows is as near as the ray's hit with the box."""
     import keypoint_pipeline as pipeline
 
     pose = pipeline.draw(3, 0).pose

@@ -184,7 +184,6 @@ def without_times(results):
 
 @pytest.mark.parametrize(("calls", "finished"), [(1, 1), (6, 3)])
 def test_interrupted_and_continued_equals_uninterrupted(path, calls, finished):
-    """The second solver has four calls on each of the two sets."""
     whole = evaluate({"first": _Fixed(), "second": _Fixed()}, SETS, repeats=3)
     with pytest.raises(KeyboardInterrupt):
         evaluate({"first": _Fixed(), "second": _Fixed(calls=calls)}, SETS, path=path)

@@ -131,7 +131,6 @@ def test_every_n_has_every_mix_and_a_set_is_the_same_beside_others(scenes):
 
 
 def test_scenes_are_the_protocols_and_of_one_name_are_named_by_their_paths(scenes):
-    """The limits depend on the unit."""
     (entry,) = draw("here/room", outliers="2", count=1000, dtype=torch.float64).values()
     assert entry.description == {"source": "room", "path": "here/room", "outliers": 2, "mismatch_share": 0.5, "seed": 3}
     assert_same(entry.problems, SceneProblems(scene(), seed=3, outliers=OutlierMix(count=2)).batch(0))
@@ -169,11 +168,11 @@ def test_weights_are_inverse_variances_by_the_jacobian(make_problems):
     camera = torch.tensor([[800.0, 0, 320], [0, 950, 240], [0, 0, 1]], dtype=torch.float64)
     problems = problems._replace(intrinsics=camera.expand(3, 3, 3))
     problems = problems._replace(img_points=problems.img_points + reprojection_errors(problems))
-    weights = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(problems).weights
+    bound, same = KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3), 10.0 * problems.intrinsics
+    weights = bound.solve_with_truth(problems).weights
     given = problems._replace(img_sigma=weights.new_tensor([2, 2, torch.nan]), world_sigma=0.3 * weights.new_ones(3, 9))
     assert_same(KnownInliersAndNoise(img_sigma=2.0).solve_with_truth(given).weights, weights)  # NaN: unknown
-    same = problems._replace(intrinsics=10.0 * problems.intrinsics)  # one camera
-    assert_same(KnownInliersAndNoise(img_sigma=2.0, world_sigma=0.3).solve_with_truth(same).weights, weights, rtol=1e-9)
+    assert_same(bound.solve_with_truth(problems._replace(intrinsics=same)).weights, weights, rtol=1e-9)
     exact = problems._replace(img_sigma=weights.new_zeros(3), world_sigma=weights.new_zeros(3))
     assert KnownInliersAndNoise().solve_with_truth(exact).ok.all()
 

@@ -192,7 +192,6 @@ def test_what_a_package_takes(make_problems, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
 def test_cpp_example(make_problems, tmp_path):
-    """The C++ program and Python get the same numbers from the same package."""
     path = packaged(tmp_path, PnPNet(None, RobustWeightedLM(1)), 9, batch=1)
     prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
     subprocess.run(["cmake", "-S", CPP, "-B", tmp_path / "build", prefix], check=True)

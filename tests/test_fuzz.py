@@ -303,7 +303,7 @@ def is_refused(call: Call) -> bool:
         or {"world_sigma", "world_cov"} <= x.keys()
         or (len(dtypes) > 1 and "mixed" in call.target.kinds)
         or (0 in (*call.size, call.n) and call.name in ("success_rate", "reliability", "diagnose"))
-        or (call.name == "reliability" and x["chances"].isnan().any())
+        or (call.name == "reliability" and not ((x["chances"] >= 0) & (x["chances"] <= 1)).all())
     )
 
 

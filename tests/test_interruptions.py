@@ -156,7 +156,6 @@ def test_kill_9_at_any_moment_loses_no_results(tmp_path):
 
 
 def test_damaged_weights_load_nothing(tmp_path):
-    """Damage gives an error, or changes neither the configuration nor the weights."""
     PnPNet(MLPInit(6), RobustWeightedLM(2)).save_pretrained(tmp_path)
     files = {name: (tmp_path / name).read_bytes() for name in ("config.json", "model.safetensors")}
     sound = PnPNet.from_pretrained(tmp_path)

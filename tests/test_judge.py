@@ -125,7 +125,8 @@ def test_the_law_is_that_of_the_results_file_and_close_to_a_new_fit():
     made = json.loads((RESULTS / "probability.json").read_text())
     assert list(LAW) == made["law"]
     grid = torch.cartesian_prod(torch.ones(1), torch.arange(-10.0, 16.0), torch.arange(-8.0, 3.0))
-    assert (grid @ torch.tensor([made["fitted"], LAW]).mT).sigmoid().diff().abs().max() < 0.05
+    chance, fitted = (grid @ torch.tensor([LAW, made["fitted"]]).mT).sigmoid().unbind(1)
+    assert (chance - fitted)[chance > 0.9].abs().max() < 0.03
 
 
 def test_noise_whose_covariance_has_no_float32_determinant_harms_its_problem_only():

@@ -189,7 +189,6 @@ def test_rotation_vectors_become_rotations_and_back_with_finite_gradients(angle,
 
 @pytest.mark.parametrize("cameras", [1, 3])
 def test_our_projection_is_kornias(cameras, random_rotations, generator):
-    """Cameras with zoom, and rigs, whose pairs have a pose of their own."""
     p = CameraProblems(n=5, batch_size=7, seed=0, cameras=cameras, dtype=torch.float64).batch(0)
     if cameras > 1:  # at any turn
         rig = Pose(random_rotations(35).unflatten(0, (7, 5)), p.cam_from_rig.translation)

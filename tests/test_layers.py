@@ -96,7 +96,6 @@ def test_optional_packages_have_one_door(package, owners):
 
 
 def test_importing_the_package_imports_no_extras_and_leaves_no_trace():
-    """Importing changes neither the seed, the threads nor the default type."""
     code = (
         "import sys, torch; torch.manual_seed(5); before = (torch.get_rng_state(), torch.get_num_threads());"
         "import kornia_pnpnet; after = (torch.get_rng_state(), torch.get_num_threads());"

@@ -53,7 +53,6 @@ def test_the_interval_is_wilsons(successes, count, low, high):
 
 
 def test_chances_that_come_true_have_no_calibration_error():
-    """Outcomes drawn with their chances; with all chances doubled the error is what was added."""
     generator = torch.Generator().manual_seed(1)
     chances = 0.5 * torch.rand(200_000, generator=generator, dtype=torch.float64)
     outcomes = torch.rand(200_000, generator=generator, dtype=torch.float64) < chances
@@ -185,7 +184,6 @@ def test_the_set_loss_has_no_unit(make_problems, perturb):
 
 
 def test_the_true_noise_is_the_likeliest(make_problems):
-    """Among sigmas that are off by a factor of two or more."""
     p = make_problems(batch=3000, outliers=2)
 
     def term(img, world):

@@ -72,7 +72,6 @@ def test_the_unit_of_the_world_changes_neither_values_nor_gradients(power, dtype
 @pytest.mark.parametrize("offset", [0.0, 1.0, 1e4])
 @pytest.mark.parametrize("n", [3, 9, 50])
 def test_points_on_a_line_are_invalid(n, offset, dtype, generator):
-    """Also where only two of the pairs are there; lines up to the rounding of the dtype."""
     direction, start = torch.randn(2, 20, 1, 3, generator=generator, dtype=DOUBLE)
     direction[:3, 0] = torch.eye(3, dtype=DOUBLE)
     along = torch.rand(20, n, 1, generator=generator, dtype=DOUBLE)

@@ -96,7 +96,6 @@ def test_shipped_weights_have_a_checksum_and_the_card_of_their_run(name, tmp_pat
     [("init", "width", 2**17), ("init", "layers", 10**7), ("refine", "m", 10**9), ("refine", "by_residual", 10**12)],
 )
 def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, value, tmp_path):
-    """Before a module of this size is built."""
     config, state = read_weights("pnpnet-set")
     config[part][name] = value
     write_weights(tmp_path, config, state)
@@ -108,7 +107,6 @@ def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, 
 
 
 def test_digests_tell_contents_apart():
-    """For any dtype, layout and order of keys."""
     x = torch.arange(6.0).reshape(2, 3)
     assert digest("a", b"b") == hashlib.sha256(b"ab").hexdigest()
     assert digest({"a": 1, "b": [2]}) == digest({"b": [2], "a": 1})

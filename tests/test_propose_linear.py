@@ -197,7 +197,6 @@ def test_gradcheck_of_the_nearest_rotation(generator):
 
 
 def test_align_finds_a_similarity(random_rotations, generator):
-    """With weights of 0 for outliers; without noise it is exact."""
     source = torch.randn(7, 9, 3, generator=generator, dtype=torch.float64)
     rotation, shift = random_rotations(7), torch.randn(7, 1, 3, generator=generator, dtype=torch.float64)
     target = 2.5 * source @ rotation.mT + shift

@@ -129,7 +129,6 @@ def test_padding_changes_nothing_where_the_network_sees_some_pairs(make_problems
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_axis_and_angle_turn_as_kornias_rotation_vectors(dtype, generator):
-    """Large and tiny angles, long and short axes; values and gradients."""
     axis = torch.randn(3, 400, generator=generator, dtype=torch.float64)
     axis *= 10.0 ** torch.linspace(-1, 3, 20, dtype=torch.float64).repeat(20)
     angle = 10.0 * torch.randn(400, generator=generator, dtype=torch.float64)
@@ -207,7 +206,6 @@ def test_a_plane_seen_from_the_front_is_not_believed(name):
 
 
 def test_the_covariance_has_the_focal_length_last():
-    """Normalised errors are chi-square with 7 degrees of freedom."""
     p = draw(40, batch=2000, noise=1.0)
     solver = PnPNet(None, RobustWeightedLM(15, robustness=0.0, damping=1e-6), Normalize(order=False), focal="unknown")
     result = solver(*p[:2], withheld(p))

@@ -222,7 +222,6 @@ def test_items_are_drawn_by_their_chances_and_none_twice(size, chances, generato
 
 
 def test_neighbours_of_inliers_agree(generator):
-    """Points of a wavy surface; the pixels of four fifths of them are anywhere."""
     flat = 6.0 * torch.rand(2, 200, 2, generator=generator, dtype=torch.float64)
     points = torch.cat((flat, 8.0 + flat.sin().sum(-1, keepdim=True)), -1)
     pixels = points[..., :2] / points[..., 2:]
@@ -268,7 +267,6 @@ def test_even_garbage_has_one_answer_in_every_order_of_its_pairs():
 
 @pytest.mark.parametrize("size", [3, 7])
 def test_the_number_of_samples_has_the_confidence(size):
-    """By counting the subsets without an outlier."""
     count = 9
     for inliers, confidence in itertools.product(range(count + 1), (0.5, 0.9999)):
         subsets = list(itertools.combinations(range(count), size))

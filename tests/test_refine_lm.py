@@ -276,7 +276,6 @@ def scene(camera, unknown, turn):
 @pytest.mark.parametrize("few", [True, False])
 @pytest.mark.parametrize(("camera", "unknown"), [("rig", 0), ("bearings", 0), *(("pixels", k) for k in range(4))])
 def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, random_rotations, monkeypatch, generator):
-    """Both forms of them, for weights and for matrices as weights."""
     state, problem = scene(camera, unknown, random_rotations(7))
     jacobian = verified_derivative(lambda x: project(x, problem).residual.flatten(0, 1).mT, state).unflatten(1, (2, 9))
     projection = project(state, problem)

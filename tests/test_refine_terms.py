@@ -159,7 +159,6 @@ def test_what_is_known_helps_and_what_is_wrong_hardly_harms(make_problems, gener
 
 @pytest.mark.parametrize("name", ["pnpnet-set:effort=fixed", "pnpnet-set:effort=adaptive", "p3p-ransac:threshold=10.0"])
 def test_gravity_chooses_among_poses(name, make_problems, generator):
-    """Of four pairs with one outlier, three decide: gravity tells their poses apart."""
     problems, solver = make_problems(n=4, batch=500, outliers=1), load_solver(name)
     found = [solver(*problems[:3], prior=x, **SIGMAS) for x in (None, gravity(problems, generator))]
     assert rate(found[1], problems) > rate(found[0], problems) + 0.02

@@ -196,7 +196,6 @@ def test_sweep_leaves_results_and_a_summary(tmp_path, train, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(("launcher", "option"), [("joblib", "n_jobs=2"), ("submitit_local", "timeout_min=5")])
 def test_sweeps_by_other_launchers(launcher, option, tmp_path):
-    """The same runs and the same summary, and a second call finds nothing left to do."""
     command, ends = ("-m", f"hydra/launcher={launcher}", f"hydra.launcher.{option}", "model.n=6,9"), []
     for _ in range(2):
         run(*command, "resume=true", f"hydra.sweep.dir={tmp_path}")
@@ -278,7 +277,6 @@ def test_every_experiment_trains(experiment, overrides, tmp_path):
 
 @pytest.mark.parametrize(("experiment", "part"), [("net_loss_only", "init"), ("identity_start", "refine")])
 def test_what_an_ablation_trains(experiment, part, tmp_path):
-    """The network alone, or the refiner alone, from the first update on."""
     config = composed(f"experiment={experiment}", *THREE)
     solver = instantiate(config.model.solver)
     before = deepcopy(solver.state_dict())

@@ -205,7 +205,6 @@ class Uneven(SyntheticProblems):
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 @pytest.mark.parametrize("source", [SyntheticProblems, Uneven])
 def test_two_processes_equal_one(source, tmp_path):
-    """Two CPU processes with gloo share the batch of one and arrive at the same weights."""
 
     def parts():
         data = source(n=6, batch_size=16, seed=3, outliers=OutlierMix(), dtype=torch.float64)
