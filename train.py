@@ -141,7 +141,7 @@ def start_from(model: PnPNet, trained: PnPNet) -> None:
     """Copy the weights of another solver. If ``m`` or the form of the refinement differs, ``model`` keeps its own.
 
     Raises:
-        ValueError: when the network of ``trained`` gets its inputs in other units or another order.
+        ValueError: when the network of ``trained`` gets its inputs with another scale, centre or order.
     """
 
     def inputs(solver: PnPNet) -> dict[str, Any]:

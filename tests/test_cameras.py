@@ -76,7 +76,6 @@ def test_fisheyes_agree_with_opencv(uniform):
 
 
 def test_where_there_is_no_pixel():
-    """Beyond the turning point of a polynomial, and beside a pinhole camera's plane."""
     turning = torch.tensor([[-0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
     for off, dist, fisheye in ((0.9, turning, None), (2.0, None, 0.0 * turning)):  # 2 radians are 115 degrees
         pixels = torch.tensor([[[320.0, 240.0], [320.0 + 400.0 * off, 240.0]]], dtype=torch.float64)

@@ -46,7 +46,6 @@ def test_zero_weight_equals_removing(make_problems):
 
 
 def test_units_of_the_noise(make_problems):
-    """A number, one per problem or one per pair; twice the noise is four times the covariance."""
     p = make_problems(n=12, batch=5)
     plain = pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.1)
     full = p.world_points.new_full
@@ -267,7 +266,6 @@ def seen(random_rotations, generator):
 
 
 def test_exact_measurements_give_exact_points(seen):
-    """Back to the points that were projected, with a skew; a sigma is a multiple of the identity, of 0 for none."""
     points, pose, pixels, depth = seen
     found, covariance = depth_points(pixels, depth, CAMERA, pose, depth_sigma=0.0)
     torch.testing.assert_close(found, points)
@@ -279,7 +277,6 @@ def test_exact_measurements_give_exact_points(seen):
 
 
 def test_covariances_of_points_are_those_of_samples(seen, generator):
-    """Also where the depth is so inexact that a first-order transport would be off."""
     _, pose, pixels, depth = seen
     sigma = (0.4 * depth[:, :1]).expand(2, 7)
     factor = torch.tensor([[30.0, 0.0], [20.0, 40.0]], dtype=DOUBLE)

@@ -95,7 +95,6 @@ EXPORTS = [
     ],
 )
 def test_exports(kind, name, n, batch, sizes, is_rig, make_problems, tmp_path):
-    """Batches of any size, with padding where any number of pairs is allowed, and with a broken problem."""
     solver = PnPNet(SetInit(), RobustWeightedLM(2, kernel="huber")) if name == "set-lm" else create_solver(name)
     solver = PnPNet(None, RobustWeightedLM(1)) if name == "identity-lm" else solver
     compiled = copy.deepcopy(solver)

@@ -161,9 +161,9 @@ def test_solve_pnp_marks_what_it_cannot_solve(make_problems):
     world[1, 2] = torch.nan
     pixels = p.img_points.clone().requires_grad_()
     registry._on_device.cache_clear()
-    torch.inference_mode()(solve_pnp)(*p[:3])  # makes the solver that later calls share
-    registry._on_device.cache_clear()
     assert torch.func.grad(lambda x: solve_pnp(p.world_points, x, p.intrinsics).sum())(p.img_points).isfinite().all()
+    registry._on_device.cache_clear()
+    torch.inference_mode()(solve_pnp)(*p[:3])  # makes the solver that later calls share
     matrix = solve_pnp(world, pixels, p.intrinsics)
     assert matrix.isnan().all((1, 2)).tolist() == [False, True, False, False]
     assert matrix[0].equal(solve_pnp(p.world_points, p.img_points, p.intrinsics)[0])

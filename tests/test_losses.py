@@ -265,6 +265,7 @@ def test_gradient_of_the_integral(of_pixels):
     with torch.no_grad():
         difference = (loss(torch.tensor(20.0)) - loss(torch.tensor(-20.0))) / 40.0
     torch.testing.assert_close(gradient, difference, rtol=0.05, atol=2e-3)
+    torch.testing.assert_close(torch.func.grad(loss)(shift.detach()), gradient)
 
 
 def test_units_of_the_likelihood():

@@ -60,7 +60,6 @@ def test_an_unknown_name_is_an_error_that_lists_the_shipped_weights_without_a_ne
 
 
 def test_weights_of_the_set_network_are_inlier_probabilities():
-    """Expected calibration error over ten bins, n from 6 to 50 and up to a third of outliers."""
     solver = create_solver("pnpnet-set")
     chances, inliers = [], []
     for n in (6, 9, 20, 50):

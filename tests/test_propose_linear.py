@@ -130,7 +130,6 @@ SQUARE = torch.tensor([[[-1, -1], [1, -1], [-1, 1], [1, 1], [2, 0], [-2, 0]]], d
 
 @pytest.mark.parametrize("plane", [SQUARE, SQUARE[:, :4], SQUARE + 0.1 * SQUARE.square()], ids=["six", "four", "odd"])
 def test_a_plane_parallel_to_the_image_has_a_gradient(plane):
-    """There the depth of one direction is free in the equations, but not in the problem."""
     pixels = (plane / 4.0).requires_grad_()
     world = torch.nn.functional.pad(plane, (0, 1))
     result = SOLVERS["EPnP"](iterations=8, gradient="always")(world, pixels, torch.eye(3).double())

@@ -32,7 +32,6 @@ def solver():
 
 @pytest.mark.parametrize(("n", "outliers"), [(4, 0), (9, 0), (9, 4), (60, 0), (60, 50)])
 def test_samples_of_inliers_have_the_true_pose(n, outliers):
-    """Where outliers are masked and there is no noise. Points in line and the like may fail."""
     options = {"max_angle": math.pi, "outliers": OutlierMix(count=outliers), "dtype": torch.float64}
     p = SyntheticProblems(n=n, batch_size=50, seed=1, img_sigma=0.0, world_sigma=0.0, **options).batch(0)
     _, guess = solver().with_starts(*p[:3], mask=p.inliers, img_sigma=0.1, world_sigma=0.001)

@@ -329,7 +329,6 @@ def test_exact_recovery_among_outliers(n, outliers, scorer, make_problems):
 
 
 def test_weights_decide_between_two_poses(make_problems):
-    """Five pairs of one pose, four of another: the four win when they weigh more."""
     one, other = make_problems(9, 20, noise=False, seed=1), make_problems(9, 20, noise=False, seed=2)
     camera = (one.world_points @ other.pose.rotation.mT + other.pose.translation[:, None])[:, 5:]
     pixels = one.img_points.clone()

@@ -149,7 +149,6 @@ def test_gradients_are_finite_from_anywhere(kernel, backward, dtype, make_proble
 
 @pytest.mark.parametrize("kernel", [name for name in KERNELS if name != "truncated"])
 def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, make_problems, perturb):
-    """Also to the shape of the kernel; step, damping and start do not move a minimum."""
     p = make_problems(8, 20, outliers=1)
     shape = {"power": 0.5}.get(kernel, 5.0)  # reweighting with 1/‖r‖ would take hundreds of iterations
     start, gradients = perturb(p.pose, angle=0.01, shift=0.1), []

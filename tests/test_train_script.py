@@ -144,7 +144,6 @@ class Mine:
 
 
 def test_data_of_ones_own_and_any_validation_sets(tmp_path, monkeypatch, train):
-    """In a sweep, which ends with a summary, and with an override that takes something away."""
     (tmp_path / "mine.py").write_text(MINE)
     monkeypatch.syspath_prepend(tmp_path)
     source = "{_target_: mine.Mine, n: 9, batch_size: 8, seed: 7, corners: 4}"

@@ -1,7 +1,7 @@
 """Fit the law of ``PnPResult.probability``, and measure the effect of each part of the judge. ``make.py`` calls this.
 
-See ``kornia_pnpnet.judge.evidence``. The coefficients go from ``probability.json`` into the code by hand; a test
-compares them.
+See ``kornia_pnpnet.judge.evidence``. The coefficients ``fitted`` of ``probability.json`` go into the code by
+hand; a test compares the two laws.
 """
 
 import math

@@ -327,13 +327,16 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         lower, scaled = factorise(rows, list(right.unbind()), inverse)
         solved = reduce(and_, good)
         return torch.where(solved, torch.stack(substitute(lower, scaled)), 0.0), solved
-    batched = damped.permute(2, 0, 1)
-    factor, info = torch.linalg.cholesky_ex(batched.detach())
-    pivots = factor.diagonal(dim1=1, dim2=2).square().add(damped.detach().diagonal(), alpha=-_PIVOT * limits.eps)
+    batched = plain = damped.permute(2, 0, 1)
+    if differentiated := batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
+        plain = batched.detach()
+    factor, info = torch.linalg.cholesky_ex(plain)
+    factored, original = (x.diagonal(dim1=1, dim2=2) for x in (factor, plain))
+    pivots = factored.square().add(original, alpha=-_PIVOT * limits.eps)
     solved = (pivots > least).all(1) & (info == 0)  # NaN compares false
     # Gradients of a failed factorisation are NaN. If gradients are needed, the matrices are factorised again. The
     # identity replaces each matrix whose factorisation failed.
-    if batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
+    if differentiated:
         factor = torch.linalg.cholesky_ex(torch.where(solved[:, None, None], batched, eye)).L
     solution = torch.cholesky_solve(right.mT[..., None], factor)[..., 0].mT
     return torch.where(solved, solution, 0.0), solved

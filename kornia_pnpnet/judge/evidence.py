@@ -93,8 +93,9 @@ _MOST_NOISE = 0.016
 _OFF = 0.05
 # The required number of points off the line is the number of inliers minus this number, but at least 1 and at most 3.
 _FEW = 4
-# Rounds of the robust fit of the line, and the least squared distance of its first weights, relative to the sum.
-_LINE_ROUNDS, _LEAST = 3, 1e-7
+# Rounds of the robust fits of the centre and of the line. A point at the centre has 1 / _NEAR times the weight that a
+# point at a typical distance has.
+_CENTRE_ROUNDS, _NEAR, _LINE_ROUNDS = 3, 0.02, 3
 
 
 class Votes(NamedTuple):
@@ -372,25 +373,27 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
     Points on a line leave one rotation free. A few outliers can determine this rotation by chance.
     """
     world, inliers = world_points.permute(2, 1, 0), inliers.mT  # (3, N, B) and (N, B)
-    there = inliers.to(world.dtype)
+    weights = there = inliers.to(world.dtype)
     number = there.sum(0)
-    # A far point off the line must not turn the first line: in the first round, points count by their direction only.
-    sq_far = (world - (world * there).sum(1, keepdim=True) / number).square().sum(0)
-    weights = there / torch.add(sq_far, (there * sq_far).sum(0), alpha=_LEAST)
     # If no inlier exists, or if all inliers are one point, the numbers are NaN, and the result is False.
+    for _ in range(_CENTRE_ROUNDS):  # far points must not turn the first line
+        share = weights / weights.sum(0)
+        sq_off = (world - (share * world).sum(1, keepdim=True)).square().sum(0)
+        weights = there / torch.add(sq_off, (share * sq_off).sum(0), alpha=_NEAR)
     for _ in range(_LINE_ROUNDS):
         share = weights / weights.sum(0)
         centred = world - (share * world).sum(1, keepdim=True)
         matrix = (centred[:, None] * (share * centred)).sum(2)  # (3, 3, B)
         matrix = matrix / matrix.amax((0, 1))
-        # The line follows the first eigenvector. The longest column of the fourth power is close to this direction.
+        # The line follows the first eigenvector. This is close to the column of the fourth power that belongs to the
+        # longest column of the matrix.
         matrix = (matrix[:, :, None] * matrix).sum(1)
         longest = matrix.diagonal().argmax(1).expand(1, 3, -1)
         direction = (matrix * matrix.gather(0, longest)).sum(1, keepdim=True)
         direction = direction / direction.norm(dim=0)
         along = (direction * centred).sum(0)
         sq_off = torch.addcmul(centred, direction, along, value=-1.0).square().sum(0)
-        sq_length = (share * along.square()).sum(0)
-        weights = there / torch.add(sq_off, sq_length, alpha=_OFF**2)
-    off = (inliers & (sq_off > _OFF**2 * sq_length)).sum(0)
+        limit = _OFF**2 * (share * along.square()).sum(0)
+        weights = there / (sq_off + limit)
+    off = (inliers & (sq_off > limit)).sum(0)
     return off >= (number - _FEW).clamp(1, MIN_PAIRS)
