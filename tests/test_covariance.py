@@ -103,7 +103,6 @@ def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
 
 @pytest.mark.parametrize(("n", "img_sigma", "world_sigma"), [(20, 1.0, 0.05), (50, 2.0, 0.0), (30, 0.0, 0.02)])
 def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sigma):
-    """Whether the pixels or the points have noise, as :func:`pose_covariance` of the true noise within a third."""
     options = {"n": n, "batch_size": 500, "seed": 10, "dtype": DOUBLE}
     p = SyntheticProblems(img_sigma=img_sigma, world_sigma=world_sigma, **options).batch(0)
     result = create_solver("pnpnet-set").double()(*p[:3])

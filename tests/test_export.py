@@ -77,6 +77,7 @@ EXPORTS = [
     ("program", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
     ("onnx", "pnpnet-n9", None, None, ((9, 1), (9, 3), (9, 100)), False),
     ("onnx", "pnpnet-set", None, None, ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)), False),
+    ("onnx", "epnp", None, None, ((4, 5), (9, 4), (50, 2)), False),
     ("onnx", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
     ("package", "identity-lm", 9, 1, ((9, 1),), False),
     ("package", "identity-lm", 9, None, ((9, 1), (9, 3), (9, 100)), False),
@@ -173,7 +174,6 @@ def test_what_an_export_needs_is_checked_before_it_starts(name, missing, tmp_pat
 
 @pytest.mark.slow
 def test_what_a_package_takes(make_problems, tmp_path):
-    """Tensors of other dtypes and layouts than the package was compiled for, but no other shapes."""
     package = load_package(packaged(tmp_path, PnPNet(None, RobustWeightedLM(1)), (12, 8), batch=2))
     assert (package.sizes, package.batch) == ((8, 12), 2)
     world, img, intrinsics, weights = inputs_of(make_problems(n=13, batch=2))

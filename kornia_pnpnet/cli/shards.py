@@ -85,6 +85,8 @@ def solve_shards(
             kept += 1
         else:
             raise InputError(target, f"no results of {name} with these options: use another folder or --overwrite")
+    for target in waiting:  # after an interruption, the same command without --overwrite must not keep old results
+        target.unlink(missing_ok=True)
     counts, failed = np.zeros(2, int), []
     with _bar(waiting.values(), progress) as bar:
         for target, shard in waiting.items():

@@ -36,7 +36,7 @@ def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[I
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # readers of a folder of tables skip hidden files
     try:
         with temporary.open(mode, **options) as file:
             yield file

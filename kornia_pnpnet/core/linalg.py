@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-from kornia_pnpnet.core.performance import are_few, compiling
+from kornia_pnpnet.core.performance import are_few, compiling, exporting
 
 # Number of Jacobi sweeps. Two sweeps of random matrices give a median error of eigenvalues below 1e-9 times the norm.
 _SWEEPS = 2
@@ -342,6 +342,11 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
     return torch.where(solved, solution, 0.0), solved
 
 
+def signed(size: Tensor, sign: Tensor) -> Tensor:
+    """Give positive numbers the signs of other numbers."""
+    return torch.where(sign < 0, -size, size) if exporting() else size.copysign(sign)  # ONNX has no `copysign`
+
+
 def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Approximate eigenvalues (B,), ascending, and orthonormal eigenvectors (3, B) of symmetric matrices (3, 3, B)."""
     a = [list(row.unbind(0)) for row in matrix.unbind(0)]
@@ -351,7 +356,7 @@ def eigenvectors(matrix: Tensor) -> list[tuple[Tensor, Tensor]]:
     for p, q, r in _SWEEPS * ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
         twice, difference = a[p][q] + a[p][q], a[q][q] - a[p][p]
         root = torch.addcmul(difference * difference, twice, twice).sqrt() + tiny
-        tangent = twice / (difference + root.copysign(difference))
+        tangent = twice / (difference + signed(root, difference))
         cosine = torch.addcmul(one, tangent, tangent).rsqrt()
         sine = tangent * cosine
         shift = tangent * a[p][q]

@@ -21,7 +21,14 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_numbers, check_whole
-from kornia_pnpnet.core.linalg import eigenvectors, nearest_rotation, small_product, solve_leading, solve_positive
+from kornia_pnpnet.core.linalg import (
+    eigenvectors,
+    nearest_rotation,
+    signed,
+    small_product,
+    solve_leading,
+    solve_positive,
+)
 from kornia_pnpnet.problem import Problem, Starts
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.result import Pose
@@ -248,7 +255,7 @@ def _four_cases(system: _DepthSystem) -> Tensor:
     square, mixed, other, third, _, fourth = torch.stack(padded, 1).unbind(0)  # ½β₁², β₁β₂, ½β₂², …, (4 cases, B)
     sign = square.sign()
     first = (2.0 * square.abs()).sqrt()
-    second = (2.0 * sign * other).clamp(min=0.0).sqrt().copysign(sign * mixed)
+    second = signed((2.0 * sign * other).clamp(min=0.0).sqrt(), sign * mixed)
     inverse = sign / first
     return small_product(basis, torch.stack((first, second, third * inverse, fourth * inverse)))
 

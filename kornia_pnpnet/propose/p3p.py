@@ -28,7 +28,8 @@ from torch import Tensor
 
 from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, common_dtype
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.performance import compiling, exporting, fold_vmap, unfold_vmap
+from kornia_pnpnet.core.linalg import signed
+from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.propose.scoring import as_pose
@@ -79,13 +80,6 @@ def _sqrt(square: Tensor) -> Tensor:
     return square.rsqrt().mul_(square)
 
 
-def _signed(size: Tensor, sign: Tensor) -> Tensor:
-    """Give a positive number the sign of another number, in place."""
-    if exporting():  # ONNX has no `copysign`
-        return torch.where(sign < 0, -size, size)
-    return size.copysign_(sign)
-
-
 def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     """Of a cubic form with coefficients (4, C), find the real root ``u : v`` that is farthest from the other two roots.
 
@@ -109,7 +103,7 @@ def _isolated_root(k: Tensor) -> tuple[Tensor, Tensor]:
     for _ in range(_CUBIC_STEPS):
         sq_x = x * x
         x = torch.addcmul(size, sq_x, x).mul_(2 / 3).div_(sq_x.sub_(p).clamp_(min=tiny))
-    root = torch.stack((_signed(x, q).sub_(third), k3))
+    root = torch.stack((signed(x, q).sub_(third), k3))
     root = root * root.abs().amax(0).clamp_(min=tiny).reciprocal_()
     u, v = root.lerp(root.flip(0), swap)
     return u, v
@@ -161,7 +155,7 @@ def _meet(slope: Tensor, offset: Tensor, v: Tensor, h: Tensor) -> Tensor:
     c0 = (offset * offset).mul_(v2 + v3).addcmul_(offset, vh23).add_(vh23.add_(vh1, alpha=2.0))
     disc = (c1 * c1).addcmul_(c2, c0, value=-1.0)
     two = _greater(disc, torch.zeros_like(disc))
-    z = _signed(_sqrt(disc.clamp_(min=torch.finfo(disc.dtype).tiny)), c1).add_(c1).neg_()
+    z = signed(_sqrt(disc.clamp_(min=torch.finfo(disc.dtype).tiny)), c1).add_(c1).neg_()
     y, dist3 = torch.stack((z, c0.mul_(two))), torch.stack((c2, z * two))
     return torch.stack((torch.addcmul(dist3, slope, y).addcmul_(offset, dist3), y.add_(dist3), dist3))
 
@@ -189,7 +183,7 @@ def _distances(p: Tensor, q: Tensor, r: Tensor, b: Tensor, g: Tensor) -> Tensor:
     dist1, dist2, dist3 = dist
     edge = dist2 - dist3
     sq_edge = edge.mul_(edge).addcmul_(b[0], dist2 * dist3)
-    return dist.mul_(_signed(sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_(), dist1))
+    return dist.mul_(signed(sq_edge.clamp_(min=torch.finfo(p.dtype).tiny ** 0.5).rsqrt_(), dist1))
 
 
 def _refined(candidates: Tensor, p: Tensor, q: Tensor, b: Tensor) -> Tensor:
