@@ -116,11 +116,11 @@ def test_implausible_answers_name_a_possible_reason(csv_file):
     assert run_main(*common)[2] == ""
     world = points(40)
     img = seen(world) + np.random.default_rng(2).normal(0, 0.3, (40, 2))
-    img[:22] = np.random.default_rng(3).uniform((0, 0), (640, 480), (22, 2))
-    for pixels, expected in ((img, {0}), (img[:, ::-1], {0, 1}), (seen(world)[:, ::-1], {1})):
+    img[:22] = np.random.default_rng(6).uniform((0, 0), (640, 480), (22, 2))
+    for pixels, expected in ((img, 0), (img[:, ::-1], 1), (seen(world)[:, ::-1], 1)):
         np.savetxt(csv_file, np.concatenate((world, pixels), 1), delimiter=",", header="X,Y,Z,u,v", comments="")
         code, _, err = run_main(*common)
-        assert (code in expected, err.count("\n")) == (True, 1)
+        assert (code, err.count("\n")) == (expected, 1)
         assert "swapped columns" in err
     assert answer(*common[1:], "--diagnose")["diagnosis"].startswith("swap u and v: 100 % of the pairs")
 

@@ -61,8 +61,7 @@ def test_copies_share_one_vote():
 def test_a_far_point_does_not_make_a_line_a_solid(length, random_rotations, generator):
     points = torch.randn(200, 9, 3, generator=generator).double() * torch.tensor([1.0, 1e-3, 1e-3])
     points[:, 0] *= torch.tensor([1.0, 1e3, 1e3]) * length
-    turned = points @ random_rotations(200).mT
-    assert _leave_a_line(turned, torch.ones(200, 9).bool()).double().mean() < 0.03
+    assert _leave_a_line(points @ random_rotations(200).mT, torch.ones(200, 9).bool()).double().mean() < 0.03
     assert _leave_a_line(torch.randn(200, 9, 3, generator=generator), torch.ones(200, 9).bool()).all()
 
 
