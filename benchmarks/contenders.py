@@ -70,10 +70,7 @@ class Task(NamedTuple):
         return 1e6 * self.seconds(times) / self.size
 
     def warm(self) -> float:
-        """Call twice, first to compile and to fill caches, and return the seconds of the second call.
-
-        CannotBeTimedError when the call warns that it does not compile.
-        """
+        """Return the seconds of a second call. Raise ``CannotBeTimedError`` if the call does not compile."""
         _compiled(self.seconds)
         return float(_compiled(self.seconds))
 

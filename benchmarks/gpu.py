@@ -1,7 +1,4 @@
-"""Our solvers on a GPU: ``python benchmarks/gpu.py`` writes ``gpu.json``.
-
-README.md beside this file describes the measurements.
-"""
+"""Our solvers on a GPU: ``python benchmarks/gpu.py`` writes ``gpu.json``; README.md describes the measurements."""
 
 import gc
 import itertools

@@ -415,10 +415,7 @@ def measure(
 
 @torch.no_grad()
 def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
-    """Time solvers on matches without a ratio test, by share of outliers and by number of pairs.
-
-    A batch repeats the problems of a group until it is full.
-    """
+    """Time solvers on matches without a ratio test, by share of outliers and by number of pairs, in full batches."""
     solvers, chosen, rows = load_solvers(specs), groups(matches), []
     with threads():
         for group in (*BY_SHARE, *BY_PAIRS):
@@ -451,10 +448,7 @@ def worst_failures(matches: Matches, far: Tensor) -> list[int]:
 
 
 def draw_failure(matches: Matches, solved: Solved, at: int, folder: Path) -> dict[str, Any]:
-    """Draw the pairs of a problem under the reference pose and under a wrong pose, and count how many fit each.
-
-    The picture has pixels and projections, no photograph.
-    """
+    """Draw the pairs of a problem under the reference pose and under a wrong pose, and count how many fit each."""
     mask, problem = matches.mask[at], take(matches.problems, torch.tensor(at))
     world, pixels = problem.world_points[mask], problem.img_points[mask]
     poses = {"reference pose": problem.pose, "pose that was found": take(solved.pose, torch.tensor(at))}

@@ -143,19 +143,23 @@ def list_column(values: np.ndarray) -> pa.Array:
 
 
 class _Cells:
-    """A column. List i is ``values[starts[i] : starts[i] + sizes[i]]``. Null numbers are NaN. Null lists are empty."""
+    """A column. List i is ``values[starts[i] : starts[i] + sizes[i]]``, empty if it, or a list in it, is null.
+
+    Null numbers are NaN.
+    """
 
     def __init__(self, name: str, column: pa.ChunkedArray) -> None:
         array = column.combine_chunks()
-        ends = np.arange(len(array) + 1)
+        ends, nulls = np.arange(len(array) + 1), np.zeros(len(array), int)
         while any(is_list(array.type) for is_list in _LISTS):  # lists from `.tolist()` are nested
+            nulls += np.diff(np.append(0, array.is_null().to_numpy(zero_copy_only=False).cumsum())[ends])
             sizes = compute.list_value_length(array).fill_null(0).to_numpy(zero_copy_only=False)
             ends = np.append(0, sizes.cumsum())[ends]
             array = compute.list_flatten(array)
         if not any(is_number(array.type) for is_number in _NUMBERS):
             raise TypeCheckError(f"the column {name} must hold lists of numbers, got {column.type}")
         self.values = array.cast(pa.float32(), safe=False).to_numpy(zero_copy_only=False)
-        self.starts, self.sizes = ends[:-1], np.diff(ends)
+        self.starts, self.sizes = ends[:-1], np.where(nulls, 0, np.diff(ends))
         self.shape, self.one_for_all = _SHAPES[name], name.endswith("_sigma")
 
     def fit(self, counts: np.ndarray) -> np.ndarray:

@@ -206,6 +206,12 @@ class Problem(NamedTuple):
         """The pixel of each pair, :math:`(B, N, 2)`. In a rig, the ray of each pair, :math:`(B, N, 3)`."""
         return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
 
+    @property
+    def centres(self) -> Tensor:
+        """The centre of each pair's camera in the frame of the rig, :math:`(B, N, 3)`."""
+        assert self.rig is not None
+        return -(self.rig.rotation * self.rig.translation[..., None]).sum(-2)
+
     def rays(self, plane_points: Tensor) -> Tensor:
         """Rays (B, N, 3) of length ``focal``, in the rig's frame, through points on the cameras' planes z = 1."""
         assert self.rig is not None

@@ -93,10 +93,10 @@ class PnPNet(PretrainedMixin):
             pairs (see :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
             :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
             in evaluation mode, the effort is adaptive if the initialiser estimates the noise and the refinement has
-            iterations. Unless the effort is ``"fixed"``, the data affect two more steps. In evaluation mode, poses of
-            single cameras are compared with other poses (see :func:`~kornia_pnpnet.propose.alternatives.reconsider`).
-            For rigs and bearings, RANSAC chooses the number of its samples. The effort is always fixed in exported
-            graphs, with ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``.
+            iterations. Unless the effort is ``"fixed"``, the data affect two more steps. In evaluation mode, poses are
+            compared with other poses (see :func:`~kornia_pnpnet.propose.alternatives.reconsider`). For rigs and
+            bearings, RANSAC chooses the number of its samples. The effort is always fixed in exported graphs, with
+            ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If no problem of the
             first batches is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems, but the
             gradients of a problem's loss with respect to normalised inputs are limited to a norm of 10. To train a
@@ -357,12 +357,13 @@ class PnPNet(PretrainedMixin):
 
     def _attempt(self, inputs: Inputs, call: _Call, *, nominal: bool = False) -> _Attempt:
         """Propose poses, refine them, and judge the best pose. ``nominal``: whether the focal length is nominal."""
-        fixed = call.first_stage_only or self.effort == "fixed" or inputs.rig is not None
+        fixed = call.first_stage_only or self.effort == "fixed"
         free = not fixed and sees_values(inputs.world_points)
         can_adapt = trait(self.init, "estimates_noise") and self.refine.m > 0
         adapts = free and (self.effort == "adaptive" or (can_adapt and not self.training))
         compares = free and not self.training and not self._whole.compiled
-        searches = adapts and self.focal == "known"  # an unknown focal length has another search
+        # Rigs are not searched, and an unknown focal length has another search.
+        searches = adapts and self.focal == "known" and inputs.rig is None
         problem, frame, starts = self._run(self._propose, inputs, call, searches)
         rival = replaced = found = odds = None
         if searches:

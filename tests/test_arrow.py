@@ -109,6 +109,7 @@ BAD = {
     "NaN": ("img_points", [float("nan")] * 18, "not_finite"),
     "a missing number": ("world_points", [None, *[1.0] * 26], "not_finite"),
     "one point": ("world_points", [1.0] * 27, "degenerate"),
+    "a missing point": ("world_points", [[1.0] * 3] * 5 + [None] + [[1.0] * 3] * 4, "malformed"),
 }
 
 
@@ -117,6 +118,8 @@ def test_a_bad_row_is_not_ok_and_changes_no_other(kind, draw):
     name, cell, status = BAD[kind]
     _, table = draw()
     good, cells = Solve("epnp-lm")(table), table[name].to_pylist()
+    if cell and isinstance(cell[0], list):
+        cells = [np.reshape(x, (-1, 3)).tolist() for x in cells]
     cells[2] = cell
     found = Solve("epnp-lm")(table.set_column(NAMES.index(name), name, pa.array(cells)))
     row = found.to_pylist()[2]

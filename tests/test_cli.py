@@ -181,6 +181,7 @@ def test_no_pose_is_exit_code_one_with_the_reason(tmp_path):
         (HEADER + GOOD + GOOD + "1,2,x,4,5\n", ":4: Z must be a finite number, got 'x'"),
         (HEADER + "\n" + GOOD + "1,2,,4,5\n", ":4: Z must be a finite number, got ''"),
         (HEADER + "1,2,3,nan,5\n" + GOOD, ":2: u must be a finite number, got 'nan'"),
+        ("X,Y,Z,u,v,weights\n1,2,3,4,5,1\n", ": the column weights is not read: use weight"),
         ("X,Y,Z,u,v,weight\n1,2,3,4,5,-1\n", ":2: weight must be a number of at least 0, got '-1'"),
         (HEADER + GOOD * 2, ": a pose needs at least 3 correspondences, got 2"),
         (HEADER + '1,2,3,4,"5\n' + GOOD, ":3: not a CSV file"),
@@ -206,6 +207,7 @@ def test_bad_npz_files(tmp_path, monkeypatch):
         ({"world_points": np.ones((0, 3)), "img_points": np.ones((0, 2))}, "at least 3 correspondences, got 0"),
         ({"img_points": np.array([[0, 0], [1, 1], [0, math.nan], [2, 2]])}, "img_points[2] must be finite"),
         ({"weights": np.array([1, 1, -2.0, 1])}, "weights[2] must be finite and at least 0"),
+        ({"mask": np.ones(4)}, "the array mask is not read: use weights"),
         ({"intrinsics": np.diag([1.0, 0.0, 1.0])}, "focal lengths must not be 0, got 1 and 0"),
         ({"intrinsics": np.eye(3) + np.eye(3, k=-1)}, "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"),
         ({}, "--intrinsics"),
@@ -296,7 +298,6 @@ def test_interruptions_are_one_line(monkeypatch, name):
 
 
 def test_evaluate_continues_and_skips_or_refuses_what_does_not_fit(csv_file, tmp_path, weights_folder):
-    """Solvers for another n are skipped, and refused alone. Another evaluation needs ``--overwrite``."""
     out_file = tmp_path / "results.json"
     common = ("evaluate", "--problems", 5, "--out", out_file, "--outliers", "none,1", "--dtype", "float64")
     assert run_main(*common, "--n", 6, "--solver", "identity-lm")[0] == 0
@@ -401,7 +402,6 @@ def test_solve_estimates_the_focal_length(csv_file):
 
 
 def test_solve_takes_cameras_of_colmap_and_with_skew_scale_and_y_up(csv_file, tmp_path):
-    """Reprojections of the command use the whole matrix, as the solver does."""
     plain = answer(csv_file, "--intrinsics", CAMERA)
     pinhole = answer(csv_file, "--camera", PINHOLE)
     assert pinhole["translation"] == pytest.approx(plain["translation"], abs=1e-6)

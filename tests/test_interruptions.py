@@ -64,7 +64,6 @@ def with_kills(tmp_path, start, moments):
 
 @pytest.mark.slow
 def test_kill_9_at_any_moment_loses_nothing(tmp_path):
-    """After any number of kills the weights and curves are those of a run without kills."""
     train(tmp_path / "whole", updates=400)
 
     def start(folder):
@@ -125,7 +124,6 @@ def test_shards_on_a_full_disk_are_whole_or_missing(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_kill_9_at_any_moment_loses_no_results(tmp_path):
-    """After any number of kills the results are those of a call without kills, and no result is made twice."""
     parquet = pytest.importorskip("pyarrow.parquet")
     source, whole = tmp_path / "in", tmp_path / "whole"
     source.mkdir()

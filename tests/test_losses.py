@@ -279,7 +279,6 @@ def test_units_of_the_likelihood():
 @pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
 def test_gradient_from_nothing(dtype, size):
-    """Predictions that fit no pose, of any size, have a finite gradient that is not zero, in every problem."""
     generator = torch.Generator().manual_seed(3)
     p = SyntheticProblems(n=16, batch_size=8, seed=2, dtype=dtype).batch(0)
     live = [(size * torch.randn(8, 16, k, generator=generator)).to(dtype).requires_grad_() for k in (3, 2)]

@@ -100,7 +100,6 @@ def test_points_off_a_line_are_valid(n, dtype, random_rotations, generator):
 
 @pytest.mark.parametrize("order", [True, False])
 def test_mirrors_show_the_same_problems_and_are_undone(order, make_problems):
-    """Every view has a pose that explains its pixels exactly, and undoing the view gives the true one."""
     p = make_problems(noise=False)
     problem, frame = Normalize(order=order)(*p[:3])
     true, count = frame.apply(p.pose), len(VIEWS)

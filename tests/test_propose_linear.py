@@ -222,7 +222,6 @@ def test_a_singular_system_in_its_range_has_a_finite_solution():
 
 @pytest.mark.usefixtures("few")
 def test_damped_systems_are_solved(generator):
-    """One that is singular and one that is no number have the solution 0, with finite gradients, and harm no other."""
     root = torch.randn(20, 6, 8, generator=generator, dtype=torch.float64)
     matrix, rhs = root @ root.mT, torch.randn(20, 6, generator=generator, dtype=torch.float64)
     matrix[3], matrix[4], matrix[5, 2, 2] = torch.nan, torch.ones(6, 6), -1.0

@@ -75,7 +75,6 @@ def test_it_learns():
 
 
 def test_padding_costs_nothing(make_problems):
-    """Problems of about the same size are solved together, without the padding of larger ones."""
     p = make_problems(n=60, batch=30, outliers=20)
     counts = torch.tensor([20, 33, 57]).repeat(10)
     mask = torch.rand(30, 60, generator=torch.Generator().manual_seed(0)).argsort(1) < counts[:, None]

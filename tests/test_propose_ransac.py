@@ -208,7 +208,6 @@ PROTOCOL = {"threshold": 6.0, "world_threshold": 0.3}
 @pytest.mark.parametrize("chances", [[0.5, 0.2, 0.0, 0.2, 0.1], [0.2] * 5 + [0.0]], ids=["unequal", "equal"])
 @pytest.mark.parametrize("size", [1, 3])
 def test_items_are_drawn_by_their_chances_and_none_twice(size, chances, generator):
-    """Items one after the other in proportion to their probabilities among those that are left."""
     draws, upper = 40000, torch.tensor(chances, dtype=torch.float64).cumsum(-1)[None]
     subsets = draw(torch.rand(draws, size, generator=generator, dtype=torch.float64), upper)[0]
     likely = [i for i, chance in enumerate(chances) if chance]
@@ -283,7 +282,6 @@ def test_the_number_of_samples_has_the_confidence(size):
 @pytest.mark.parametrize("in_world", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_errors_without_division_are_the_textbooks(of_pairs, in_world, dtype, make_problems, perturb):
-    """Squared residual over squared threshold of ten poses of each problem, infinite behind the camera."""
     p = make_problems(9, 7, outliers=2)
     problem, frame = Normalize(order=False)(*p[:3])
     truth = frame.apply(p.pose)

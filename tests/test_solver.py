@@ -327,7 +327,6 @@ def _solve_each(solver, problems, places):
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "identity-lm"])
 def test_a_data_loader_returns_results_and_loaded_weights_can_be_trained(name):
-    """A process of its own solves one problem per item, without ``torch.no_grad``."""
     solve = partial(_solve_each, create_solver(name), SyntheticProblems(n=9, batch_size=4, seed=0).batch(0))
     result = next(iter(DataLoader(range(4), batch_size=4, num_workers=1, collate_fn=solve)))
     assert result.rotation.shape == (4, 3, 3)

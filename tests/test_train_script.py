@@ -93,7 +93,6 @@ def test_run_writes_results_and_resumes(tmp_path, train):
 
 
 def test_run_starts_from_weights(tmp_path, train):
-    """With learning rates of 0 the weights stay as they are."""
     learn_nothing = ("train.lr=0", "train.lr_refine=0", "train.ramp=[0,0]")
     weights = PnPNet.from_pretrained("pnpnet-n9")
     kernel = weights.refine.config["kernel"]

@@ -177,13 +177,11 @@ def test_schedules():
 
 
 def test_training_outside_the_main_thread(tmp_path):
-    """Signals cannot be caught there. The training runs anyway."""
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(fit, folder=tmp_path, **make_parts()).result().update == 6
 
 
 def test_train_briefly(tmp_path):
-    """A run in the folder is replaced, but not before the duration was checked."""
     old = tmp_path / CHECKPOINT_NAME
     old.write_bytes(b"old")
     for seconds in (0.0, -1.0, math.nan, math.inf, None, "1", True):

@@ -34,6 +34,10 @@ class Server:
     def __call__(self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> PnPResult:
         """Wait for the result of one problem: (N, 3), (N, 2) and (3, 3)."""
         future: Future[PnPResult] = Future()
+        if [*map(len, (world_points.mT, img_points.mT, intrinsics))] != [3, 2, 3] or len(world_points) != len(
+            img_points
+        ):
+            raise ValueError("expected shapes (N, 3), (N, 2) and (3, 3)")
         self.waiting.put(((world_points, img_points, intrinsics), future))
         return future.result()
 
@@ -43,12 +47,16 @@ class Server:
             batch = [self.waiting.get()]
             while len(batch) < self.most and not self.waiting.empty():  # nobody else takes problems
                 batch.append(self.waiting.get())
-            world, img, cameras = zip(*(pairs for pairs, _ in batch), strict=True)
-            mask = pad_sequence([torch.ones(len(x), dtype=torch.bool) for x in world], batch_first=True)
-            padded = (pad_sequence(list(x), batch_first=True) for x in (world, img))
-            results = self.solver(*padded, torch.stack(cameras), mask=mask)
-            for i, (_, future) in enumerate(batch):
-                future.set_result(map_tensors(lambda x, i=i: x[i], results))
+            try:
+                world, img, cameras = zip(*(pairs for pairs, _ in batch), strict=True)
+                mask = pad_sequence([torch.ones(len(x), dtype=torch.bool) for x in world], batch_first=True)
+                padded = (pad_sequence(list(x), batch_first=True) for x in (world, img))
+                results = self.solver(*padded, torch.stack(cameras), mask=mask)
+                for i, (_, future) in enumerate(batch):
+                    future.set_result(map_tensors(lambda x, i=i: x[i], results))
+            except Exception as error:  # a request of an incorrect shape must not end the thread
+                for _, future in batch:
+                    future.set_exception(error)
 
 
 def latencies(solve: Solve, problems: list[tuple[Tensor, ...]], clients: int) -> dict[str, float]:

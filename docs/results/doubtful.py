@@ -53,6 +53,8 @@ def doubtful(count: int, seed: int) -> Iterator[Kind]:
         if copied:
             points[:, -copied:], pixels[:, -copied:] = points[:, :copied], pixels[:, :copied]
         yield Kind(f"{pairs} random pairs" + f", {copied} listed twice" * (copied > 0), points, pixels, None, {})
+    points, pixels = normal(40, 3).repeat(1, 3, 1), anywhere(40).repeat(1, 3, 1)
+    yield Kind("40 random pairs in 3 frames, 1 px apart", points, pixels + normal(120, 2), None, {})
     for copies in (2, 50):
         points, truth = normal(3, 3), pose(6.0)
         pixels = seen(points, truth, 0.0)
@@ -78,3 +80,5 @@ def doubtful(count: int, seed: int) -> Iterator[Kind]:
         points = corners.expand(count, 4, 3).clone()
         given = {"img_sigma": sigma, "world_sigma": 0.0}
         yield Kind(f"tag of {size} px, {sigma} px", points, seen(points, truth, sigma), truth, given)
+    points, truth = torch.cat([points + x * torch.tensor([2.0, 0.0, 0.0]) for x in (-1, 1)], 1), pose(8.0, 0.3)
+    yield Kind("2 tags of 10 px, 400 px apart, 0.3 px", points, seen(points, truth, 0.3), truth, {})

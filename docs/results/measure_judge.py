@@ -33,7 +33,7 @@ from kornia_pnpnet.refine.lm import RobustWeightedLM
 #: The solvers of the fit, and other solvers that are only measured.
 FITTED, MEASURED = ("pnpnet-set", "p3p-ransac", "pnpnet-set:effort=fixed"), ("epnp-lm", "reppnp-lm")
 #: Kinds of problems that the fit leaves out. A test of the noise or of the points decides about them.
-LEFT_OUT = ("y up", "left-handed", "row and column", "line", "3 pairs")
+LEFT_OUT = ("y up", "left-handed", "row and column", "line", "2 tags", "3 pairs")
 PROBLEMS = 500
 ARGUMENTS = ("world_points", "img_points", "intrinsics")
 
@@ -111,21 +111,21 @@ def solved(name: str, kind: Drawn) -> dict[str, Tensor]:
     ) -> Any:
         refined = judge(self, plan, now, found, odds)
         factor = evidence.within_limits(sigmas[-1]) * (1.0 if odds is None else odds.sigmoid())
-        variables = torch.stack(evidence.clipped(refined.evidence.log_ratio, sigmas[-1]), -1)
-        seen.append((variables.double(), refined.probability > 0, factor.double()))
+        variable = refined.evidence.log_ratio.clamp(*evidence.LAW_RANGE)
+        seen.append((variable.double(), refined.probability > 0, factor.double()))
         return refined
 
     patch = mock.patch.object
     with patch(evidence, "pose_sigma", watched_sigma), patch(RobustWeightedLM, "judge", watched_judge):
         result = solver(**kind.inputs)
-    variables, usable, factor = (torch.cat(x) for x in zip(*seen, strict=True))
+    variable, usable, factor = (torch.cat(x) for x in zip(*seen, strict=True))
     near = right = torch.zeros_like(result.ok)
     if kind.truth is not None:
         turn, shift = errors(result.pose, kind.truth)
         shift = shift / kind.distance
         near, right = (turn <= 10) & (shift <= 0.3), (turn < 2) & (shift < 0.05)
     found = {"ok": result.ok, "probability": result.probability, "near": near, "right": right, "usable": usable}
-    return {**found, "variables": variables, "factor": factor}
+    return {**found, "variable": variable, "factor": factor}
 
 
 def errors(pose: Pose, truth: Pose) -> tuple[Tensor, Tensor]:
@@ -145,15 +145,15 @@ def fit_law(rows: list[dict[str, Tensor]]) -> list[float]:
 
     The probability of "near" is that of the law, multiplied by the probabilities of a small error and of no rival.
     """
-    parts = [tuple(row[key][row["usable"]] for key in ("variables", "factor", "near")) for row in rows]
-    variables, factor, near = (torch.cat(x) for x in zip(*parts, strict=True))
+    parts = [tuple(row[key][row["usable"]] for key in ("variable", "factor", "near")) for row in rows]
+    variable, factor, near = (torch.cat(x) for x in zip(*parts, strict=True))
     weight = torch.cat([torch.full(x[1].shape, 1.0 / len(row["near"])) for x, row in zip(parts, rows, strict=True)])
-    law = torch.zeros(3, dtype=torch.double, requires_grad=True)
+    law = torch.zeros(2, dtype=torch.double, requires_grad=True)
     optimiser = torch.optim.LBFGS([law], max_iter=1000, tolerance_change=1e-12, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        probability = torch.sigmoid(law[0] + variables @ law[1:]) * factor
+        probability = torch.sigmoid(law[0] + law[1] * variable) * factor
         value = functional.binary_cross_entropy(probability, near.double(), weight.double(), reduction="sum")
         value.backward()
         return value
@@ -175,14 +175,14 @@ def _keeps_noise(self: RobustWeightedLM, plan: Any, now: Any) -> Any:
 #: Each part of the judge: the object, the name in the object, and the value that switches the part off.
 PARTS: dict[str, tuple[Any, str, Any]] = {
     "wide inliers": (evidence, "_TAIL", 0.0),
-    "votes of copies": (evidence, "copies", lambda rows, there: torch.ones_like(rows[..., 0])),  # no pair is a copy
+    "votes of copies": (evidence, "totals", lambda group, values: torch.ones_like(values)),  # no pair is a copy
     "choice of the points' noise": (RobustWeightedLM, "shown", _keeps_noise),
     "rival of larger noise": (alternatives, "_GAP", -math.inf),
     "rival of the search": (alternatives, "_APART", math.inf),
     "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
     "standard deviation of the pose": (evidence, "within_limits", torch.ones_like),
     "limit of the noise": (evidence, "_MOST_NOISE", math.inf),
-    "points off a line": (evidence, "_leave_a_line", lambda world_points, inliers: inliers.any(-1)),
+    "points off a line": (evidence, "_leave_a_line", lambda projection, inliers, sigma: inliers.any(-1)),
 }
 
 

@@ -7,10 +7,10 @@ outlier. The log-likelihood ratio is
 
 .. math:: L(s) = \sum_i v_i \log(w\,d_i(s) + 1 - w)
 
-minus the three largest positive logarithms, because any three pairs fit some pose. The vote :math:`v_i` is the inverse
-of the number of pairs with about the same pixel and point. Expectation-maximisation (EM) estimates :math:`w`. If the
-noise is unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1, 8, 64, ..., and larger values have
-lower prior probabilities.
+minus the positive terms of the three points with the largest terms, because any three points fit some pose. The vote
+:math:`v_i` is the inverse of the number of pairs with about the same pixel and point. Expectation-maximisation (EM)
+estimates :math:`w`. If the noise is unknown, :math:`s` takes the values of a grid. Otherwise :math:`s` is 1, 8, 64,
+..., and larger values have lower prior probabilities.
 
 Let :math:`M` be the mean of :math:`\exp L(s)`, weighted by the prior probability of :math:`s`. The *evidence* is
 :math:`\log M - \log n - \log k`, where :math:`n` is the number of possible minimal samples, and :math:`k` the largest
@@ -37,27 +37,28 @@ from kornia_pnpnet.refine.residual import Projection, information, normal_equati
 __all__ = [
     "FAR_TURN",
     "LAW",
+    "LAW_RANGE",
     "LEAST_PROBABILITY",
     "AtPose",
     "Evidence",
     "Mixture",
     "Votes",
     "at_pose",
-    "clipped",
-    "copies",
     "evidence",
+    "groups",
     "pose_sigma",
     "probability",
+    "totals",
     "updated",
     "within_limits",
 ]
 
-# Smallest standard deviation in the grid for unknown noise, in radians.
-_LEAST_ANGLE = 1e-4
+# Smallest standard deviation in the grid for unknown noise, in radians (0.1 px at a focal length of 3000 px).
+_LEAST_ANGLE = 1e-4 / 8.0**0.5
 # Ratio of neighbouring variances in the grid.
 _STEP = 8.0
 # Number of variances in the grid. The largest standard deviation is 0.018 rad (14 px at a focal length of 800 px).
-_SCALES = 6
+_SCALES = 7
 # If the caller gave the noise, `s = 8^k` has a prior log-probability of k times this number.
 _UNEXPECTED = -3.0
 # Numbers of EM rounds: `_ROUNDS` estimate the share of inliers at each fixed `s`, `_FINAL_ROUNDS` also estimate `s`.
@@ -72,30 +73,33 @@ _LEAST_SHARE = 3e-3
 _PIXEL_CELL, _POINT_CELL = 2e-3, 1e-2
 # Largest number of poses per minimal sample.
 _POSES = 4
-# To make equal rows adjacent, rows are sorted by a key: the sum of their entries times powers of this number. Because
+# Each row gets a key: the sum of its entries times powers of this number. Rows with equal keys count as equal. Because
 # the number is transcendental, different rows of integers have different keys.
 _KEY = math.pi / 4
 
 #: Least :func:`probability` of a believed pose. A Gaussian error is within two sigmas with about this probability.
 LEAST_PROBABILITY = 0.955
-#: Coefficients of the log-odds in :func:`probability`: the constant, the factor of the evidence, and the factor of the
-#: logarithm of :func:`pose_sigma`. ``python docs/results/make.py measure --only probability`` fitted these numbers,
-#: and fits them again for comparison.
-LAW = (-0.3903, 0.6585, -0.2581)
-# Ranges to which the evidence and the logarithm of `pose_sigma` are clipped in :func:`probability`.
-_EVIDENCE, _LOG_SIGMA = (-10.0, 15.0), (-8.0, 2.0)
+#: Coefficients of the log-odds in :func:`probability`: the constant, and the factor of the evidence.
+#: ``python docs/results/make.py measure --only probability`` fitted these numbers, and fits them again for comparison.
+LAW = (0.3166, 0.6848)
+#: Range to which the evidence is clipped in :func:`probability`.
+LAW_RANGE = (-10.0, 15.0)
 #: Largest errors of a correct pose: rotation error in radians, translation error as a share of the points' distance.
 FAR_TURN, _FAR_SHIFT = math.radians(10.0), 0.3
 # Largest standard deviation, in radians, of plausible noise. The value 0.0125 would reject 4 % of the correct poses of
 # indoor RGB-D matches (`rgbd/indoor.npz`, without a ratio test).
 _MOST_NOISE = 0.016
-# A point is off a line if its distance from the line exceeds this multiple of the standard deviation along the line.
-_OFF = 0.05
+# In each round of the fit of a line, points lose weight if their distance from the line exceeds this multiple of the
+# standard deviation along the line. The last multiple is small, because an outlier must not turn a long line.
+_OFF = 0.05, 2e-3, 1e-4
+# A point is off a line if the camera sees it away from the line by more than _CLEARLY standard deviations of a pixel,
+# and by more than _LEAST_OFF radians.
+_CLEARLY, _LEAST_OFF = 2.0, 2e-4
 # The required number of points off the line is the number of inliers minus this number, but at least 1 and at most 3.
 _FEW = 4
-# Rounds of the robust fits of the centre and of the line. A point at the centre has 1 / _NEAR times the weight that a
-# point at a typical distance has.
-_CENTRE_ROUNDS, _NEAR, _LINE_ROUNDS = 3, 0.02, 3
+# Rounds of the robust fit of the line's centre. A point at the centre has 1 / _NEAR times the weight that a point at a
+# typical distance has.
+_CENTRE_ROUNDS, _NEAR = 3, 0.02
 
 
 class Votes(NamedTuple):
@@ -103,12 +107,14 @@ class Votes(NamedTuple):
 
     Attributes:
         pairs: votes (B, N). A vote is 1 over the number of copies of the pair (including the pair), or 0 for padding.
+        points: for each pair, an index that only pairs with the same world point have in common, (B, N).
         known: whether the caller gave any noise of the problem, bool (B, 1).
         outlier: density of an outlier's pixel, divided by the peak of the inliers' narrow component at a variance of
             1 px², (B, 1). The value is for equal shares of inliers and outliers.
     """
 
     pairs: Tensor
+    points: Tensor
     known: Tensor
     outlier: Tensor
 
@@ -117,14 +123,17 @@ class Votes(NamedTuple):
     def of(cls, problem: Problem, known: Tensor) -> Votes:
         """Count copies of pairs. Outliers are uniform on a square of the same variance as the usual pairs' pixels."""
         there = problem.weights > 0
-        cells = torch.cat((problem.img_points / (_PIXEL_CELL * problem.focal), problem.world_points / _POINT_CELL), -1)
-        pairs = torch.where(there, copies(cells.round(), there).reciprocal(), 0.0)
+        world, weights = problem.world_points, there.to(problem.weights)
+        cells = torch.cat((problem.img_points / (_PIXEL_CELL * problem.focal), world / _POINT_CELL), -1).round()
+        # Points are the same only if they are equal: outliers far away can make all other points share one cell.
+        pairs, points = groups(torch.stack((cells, functional.pad(world, (2, 0)))))
+        pairs = weights / totals(pairs, weights).clamp(min=1.0)
         usual = (problem.usual_weights > 0).to(problem.weights)[..., None]
         share = usual / usual.sum(1, keepdim=True).clamp(min=1.0)
         places = problem.places
         variance = (share * (places - (share * places).sum(1, keepdim=True)).square()).sum((1, 2))[:, None]
         area = 6.0 * variance + (LEAST_NOISE * problem.focal).square()
-        return cls(pairs, known, 2.0 * math.pi / (1.0 - _TAIL) / area)
+        return cls(pairs, points, known, 2.0 * math.pi / (1.0 - _TAIL) / area)
 
 
 class AtPose(NamedTuple):
@@ -206,17 +215,18 @@ class Evidence(NamedTuple):
         return self.grid.amax(1)
 
 
-@torch.no_grad()
-def copies(rows: Tensor, there: Tensor) -> Tensor:
-    """For each row of (B, N, C), count equal rows whose ``there``, bool (B, N), is true. Each count is at least 1."""
-    key = _KEY ** torch.arange(rows.shape[-1], dtype=rows.dtype, device=rows.device)
-    order = (rows * key).sum(-1).argsort(1)
-    ordered = rows.gather(1, order[..., None].expand_as(rows))
-    # `long`, because PyTorch 2.13 cannot compile the maximum of booleans.
-    new = (ordered[:, 1:] != ordered[:, :-1]).long().amax(-1)
-    run = functional.pad(new.cumsum(1), (1, 0))
-    sizes = torch.zeros_like(rows[..., 0]).scatter_add(1, run, there.to(rows).gather(1, order))
-    return torch.empty_like(sizes).scatter(1, order, sizes.gather(1, run)).clamp(min=1.0)
+def groups(rows: Tensor) -> Tensor:
+    """For each row of (*, N, C), an index below N that equal rows have in common, (*, N)."""
+    powers = _KEY ** torch.arange(rows.shape[-1], dtype=torch.float64, device=rows.device)
+    # Contiguous, because the sums of equal rows must be equal to the last bit.
+    ordered, order = (rows.contiguous() * powers).sum(-1).sort(-1)
+    run = functional.pad((ordered[..., 1:] != ordered[..., :-1]).cumsum(-1), (1, 0))
+    return torch.empty_like(order).scatter(-1, order, run)
+
+
+def totals(group: Tensor, values: Tensor) -> Tensor:
+    """For each entry of :func:`groups`, (B, N), sum ``values`` (B, N) over the equal entries."""
+    return torch.zeros_like(values).scatter_add(1, group, values).gather(1, group)
 
 
 @torch.no_grad()
@@ -236,8 +246,11 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
         share = share * (chances / torch.addcmul(outlier, share, more)).sum(-1, keepdim=True)
         share = share.clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
     terms = (torch.addcmul(outlier, share, more) / outlier).log()
-    fitted = (terms * there).topk(MIN_PAIRS, -1).values.clamp(min=0.0).sum(-1, keepdim=True)
-    likelihood = (votes.pairs * terms).sum(-1, keepdim=True) - fitted + log_prior  # (F, B, 1)
+    terms = votes.pairs * terms
+    # Three points fit any pose. If they were detected repeatedly, all of their pairs do.
+    by_point = torch.zeros_like(terms).scatter_add(-1, votes.points.expand_as(terms), terms)
+    fitted = by_point.topk(MIN_PAIRS, -1).values.clamp(min=0.0).sum(-1, keepdim=True)
+    likelihood = terms.sum(-1, keepdim=True) - fitted + log_prior  # (F, B, 1)
     last = total[:, 0].clamp(min=MIN_PAIRS) - 1.0
     samples = last**3 - last  # six times the number of triples
     log_ratio = likelihood.logsumexp(0)[:, 0] - (_POSES / 6.0 * samples).log()
@@ -289,9 +302,9 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
 def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, odds: Tensor | None = None) -> Tensor:
     """Probability (B,) of errors of at most 10 degrees (rotation) and 30 % of the points' distance (translation).
 
-    The result has three factors. The first is a logistic function of the evidence and of log :func:`pose_sigma`. The
-    second is :func:`within_limits`. The third is the logistic function of ``odds`` (B,), the log-odds of the pose
-    against other poses (``None``: no other poses). The result is 0 if the points of almost all inliers lie on a line.
+    The result has three factors. The first is a logistic function of the evidence. The second is :func:`within_limits`
+    of :func:`pose_sigma`. The third is the logistic function of ``odds`` (B,), the log-odds of the pose against other
+    poses (``None``: no other poses). The result is 0 if almost all inliers lie on a line, as far as the camera sees.
     Implausible noise, for example of mirrored pixels, also gives 0. Where ``known`` (B, 1) is true, noise up to the
     caller's noise is plausible, too.
     """
@@ -299,17 +312,11 @@ def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, 
     precision = map_tensors(lambda x: scale * x, seen.precision)
     plausible = (found.sigma < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
     sigma = pose_sigma(seen.projection, problem, precision).detach()
-    usable = plausible & _leave_a_line(problem.world_points, found.inlier > 0.5)
-    log_ratio, log_sigma = clipped(found.log_ratio, sigma)
-    offset, by_evidence, by_sigma = LAW
-    chance = torch.sigmoid(offset + by_evidence * log_ratio + by_sigma * log_sigma) * within_limits(sigma)
+    usable = plausible & _leave_a_line(seen.projection, problem, found.inlier > 0.5, found.sigma)
+    offset, by_evidence = LAW
+    chance = torch.sigmoid(offset + by_evidence * found.log_ratio.clamp(*LAW_RANGE)) * within_limits(sigma)
     chance = chance if odds is None else chance * torch.sigmoid(odds)
     return torch.where(usable, chance, 0.0)
-
-
-def clipped(log_ratio: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Clip the evidence and the logarithm of sigma to the ranges for which :data:`LAW` was fitted."""
-    return log_ratio.clamp(*_EVIDENCE), sigma.log().clamp(*_LOG_SIGMA).to(log_ratio.dtype)
 
 
 def within_limits(sigma: Tensor) -> Tensor:
@@ -367,12 +374,13 @@ def _form(matrix: Tensor, vector: Tensor) -> Tensor:
     return torch.where(form.isnan(), torch.inf, form)  # ONNX has no `nan_to_num` of float64
 
 
-def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
-    """Whether enough points (B, N, 3) of the inliers (B, N) lie off their best-fitting line, bool (B,).
+def _leave_a_line(projection: Projection, problem: Problem, inliers: Tensor, sigma: Tensor) -> Tensor:
+    """Whether the camera sees enough points of the inliers (B, N) away from their best-fitting line, bool (B,).
 
-    Points on a line leave one rotation free. A few outliers can determine this rotation by chance.
+    Points on a line leave one rotation free. A few outliers can determine this rotation by chance. ``sigma`` (B,) is
+    the standard deviation of a pixel in radians.
     """
-    world, inliers = world_points.permute(2, 1, 0), inliers.mT  # (3, N, B) and (N, B)
+    world, inliers = projection.rotated, inliers.mT  # (3, N, B) and (N, B)
     weights = there = inliers.to(world.dtype)
     number = there.sum(0)
     # If no inlier exists, or if all inliers are one point, the numbers are NaN, and the result is False.
@@ -380,7 +388,7 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
         share = weights / weights.sum(0)
         sq_off = (world - (share * world).sum(1, keepdim=True)).square().sum(0)
         weights = there / torch.add(sq_off, (share * sq_off).sum(0), alpha=_NEAR)
-    for _ in range(_LINE_ROUNDS):
+    for off in _OFF:
         share = weights / weights.sum(0)
         centred = world - (share * world).sum(1, keepdim=True)
         matrix = (centred[:, None] * (share * centred)).sum(2)  # (3, 3, B)
@@ -392,8 +400,12 @@ def _leave_a_line(world_points: Tensor, inliers: Tensor) -> Tensor:
         direction = (matrix * matrix.gather(0, longest)).sum(1, keepdim=True)
         direction = direction / direction.norm(dim=0)
         along = (direction * centred).sum(0)
-        sq_off = torch.addcmul(centred, direction, along, value=-1.0).square().sum(0)
-        limit = _OFF**2 * (share * along.square()).sum(0)
-        weights = there / (sq_off + limit)
-    off = (inliers & (sq_off > limit)).sum(0)
-    return off >= (number - _FEW).clamp(1, MIN_PAIRS)
+        away = torch.addcmul(centred, direction, along, value=-1.0)
+        sq_off = away.square().sum(0)
+        weights = there / torch.add(sq_off, (share * along.square()).sum(0), alpha=off**2)
+    points = world + projection.state.pose.translation.mT[:, None]
+    if problem.rig is not None:
+        points = points - problem.centres.permute(2, 1, 0)
+    sq_turned = torch.linalg.cross(away, points, dim=0).square().sum(0)  # `norm` is slow in this layout
+    clear = sq_turned > ((_CLEARLY * sigma).clamp(min=_LEAST_OFF) * points.square().sum(0)).square()
+    return (inliers & clear).sum(0) >= (number - _FEW).clamp(1, MIN_PAIRS)

@@ -33,7 +33,7 @@ _NEAR_MIRROR = 0.2
 # A rival is another pose that may explain the pairs. _WIDE_ANGLE (rad) is the least initial noise of the wide rival.
 _WIDE_ANGLE = 6.4e-3
 # Index of the first entry of `Evidence.grid` whose noise is at least _WIDE_ANGLE.
-_WIDE_FROM = 4
+_WIDE_FROM = 5
 # The wide rival is tried only if the larger noise lowers the log-likelihood by less than this number per vote.
 _GAP = 0.4
 # The wide rival is tried only if the share of inliers is below this number.
@@ -134,7 +134,7 @@ def reconsider(
     with torch.no_grad():
         inlier = _shares(found.inlier)
         mirrored = _mirrored(pose, problem, inlier)
-        away = (problem.img_points - _mean(problem.img_points, inlier)[:, None]).square().sum(-1)
+        away = (problem.places - _mean(problem.places, inlier)[:, None]).square().sum(-1)
         sq_spread = (inlier * away).sum(-1, keepdim=True)
         projection = project(State(mirrored, now.state.camera), problem)
         close = projection.in_front & (projection.sq_residual < _NEAR_MIRROR**2 * sq_spread)
@@ -198,7 +198,10 @@ def _moved(points: Tensor, pose: Pose) -> Tensor:
 
 
 def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
-    """Apply a half turn about the best-fit plane's normal, then the pose, then a half turn about the line of sight."""
+    """Apply a half turn about the best-fit plane's normal, then the pose, then a half turn about the line of sight.
+
+    In a rig, the line of sight starts at the mean centre of the inliers' cameras.
+    """
     middle = _mean(problem.world_points, shares)
     centred = problem.world_points - middle[:, None]
     covariance = torch.bmm(centred.mT, shares[..., None] * centred)
@@ -207,7 +210,8 @@ def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
     else:  # cuSOLVER needs 250 KiB for each matrix, and fails for 100,000 matrices
         normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
     seen = torch.baddbmm(pose.translation[..., None], pose.rotation, middle[..., None])
-    rotation = torch.bmm(torch.bmm(_half_turn(seen[..., 0]), pose.rotation), _half_turn(normal))
+    sight = seen[..., 0] if problem.rig is None else seen[..., 0] - _mean(problem.centres, shares)
+    rotation = torch.bmm(torch.bmm(_half_turn(sight), pose.rotation), _half_turn(normal))
     return Pose(rotation, torch.baddbmm(seen, rotation, middle[..., None], alpha=-1)[..., 0])
 
 

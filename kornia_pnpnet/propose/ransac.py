@@ -47,7 +47,8 @@ class RANSAC(Initialiser):
     the inliers improve this pose (LO-RANSAC). The search of a problem ends when the probability of at least one sample
     without outliers reaches ``confidence``. If a problem has at most ``max_samples`` possible samples, no sample is
     drawn twice. All problems and calls use the same random numbers. Except for rounding, the result of a problem
-    therefore does not depend on the batch. Pairs with a larger confidence are drawn more often.
+    therefore does not depend on the batch. Pairs with a larger confidence are drawn more often. Except in rigs, pairs
+    whose pixels are in one cell of the size of the threshold share one weight in the score.
 
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
     least squares, the weight of an inlier is :math:`\tau^2` divided by the right-hand side, without gradient. The final

@@ -19,6 +19,7 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.performance import exporting
 from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.judge.evidence import groups, totals
 from kornia_pnpnet.judge.inliers import MAX_ERROR, Thresholds
 from kornia_pnpnet.problem import Problem, Term
 from kornia_pnpnet.result import Pose
@@ -63,7 +64,7 @@ class Scene(NamedTuple):
     Attributes:
         rows: :math:`x - z\,b_u/f`, :math:`y - z\,b_v/f` and :math:`z \tau / f` as linear functions of a pose. Each
             function has a coefficient per entry of :func:`as_pose`, and a constant. Shape :math:`(P, 3, N, 13)`.
-        weights: weights of the pairs, shape :math:`(P, 1, N)`.
+        weights: weights of the pairs, see :meth:`of`, shape :math:`(P, 1, N)`.
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)` or :math:`(P, N, 1)`.
         terms: priors of the poses.
     """
@@ -75,8 +76,16 @@ class Scene(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
-        """Convert problems to a scene of the given dtype."""
+        """Convert problems to a scene of the given dtype.
+
+        Except in rigs, pairs whose pixels are in one cell share one weight. A cell has the size of the threshold.
+        Otherwise, a far camera could make all points inliers of a small spot with many outliers.
+        """
+        weights = problem.weights
         if problem.rig is None:
+            cells = (problem.img_points / thresholds.img[..., None]).round()
+            all_weights = totals(groups(cells), weights)
+            weights = weights * (weights / all_weights.clamp(min=torch.finfo(weights.dtype).tiny))
             eye = torch.eye(3, 4, dtype=problem.weights.dtype, device=problem.weights.device)
             first, second, third = eye.expand(1, 1, 3, 4).unbind(2)
         else:
@@ -88,7 +97,7 @@ class Scene(NamedTuple):
         products = camera[..., :3, None] * points[:, None, :, None]
         scene = cls(
             torch.cat((products.flatten(-2), camera[..., 3:]), -1),
-            problem.weights[:, None],
+            weights[:, None],
             thresholds.world.square()[..., None] + torch.finfo(dtype).tiny,  # avoids 0/0 at the camera centre
             problem.pose_terms,
         )

@@ -15,7 +15,7 @@ from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.linalg import align, solve_symmetric
 from kornia_pnpnet.core.performance import are_few, compiling, present_first, problems_last, sees_values, take_pairs
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.judge.evidence import copies
+from kornia_pnpnet.judge.evidence import groups, totals
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.p3p import minimal_poses
@@ -136,8 +136,9 @@ class _View:
 @torch.no_grad()
 def _repeats(problem: Problem) -> Tensor:
     """Logarithms (B, N, 2) of two counts: the pairs that share the pixel of a pair, and those that share its point."""
-    there = problem.usual_weights > 0
-    return torch.stack([copies(x, there) for x in (problem.img_points, problem.world_points)], -1).log()
+    there = (problem.usual_weights > 0).to(problem.weights)
+    counts = [totals(groups(x), there) for x in (problem.img_points, problem.world_points)]
+    return torch.stack(counts, -1).clamp(min=1.0).log()
 
 
 def _frame(affine: Tensor, squares: Tensor) -> Tensor:

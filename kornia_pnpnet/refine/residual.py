@@ -241,7 +241,8 @@ def normal_equations(
     """
     unit, sq_inverse = None, projection.inv_depth * projection.inv_depth
     if relative:
-        sizes = (weights if isinstance(weights, Tensor) else weights.uu + weights.vv).detach()
+        sizes = weights if isinstance(weights, Tensor) else weights.uu + weights.vv
+        sizes = sizes.detach() if torch.is_grad_enabled() else sizes
         unit = sizes.amax(1, keepdim=True).clamp(min=torch.finfo(sizes.dtype).tiny ** 0.5)
         weights = map_tensors(lambda w: w / unit, weights)
     weights = map_tensors(lambda w: w.mT * sq_inverse, weights)
