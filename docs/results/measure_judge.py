@@ -182,7 +182,7 @@ PARTS: dict[str, tuple[Any, str, Any]] = {
     "rival of the mirror image": (alternatives, "_NEAR_MIRROR", 0.0),
     "standard deviation of the pose": (evidence, "within_limits", torch.ones_like),
     "limit of the noise": (evidence, "_MOST_NOISE", math.inf),
-    "points off a line": (evidence, "_leave_a_line", lambda projection, inliers, sigma: inliers.any(-1)),
+    "points off a line": (evidence, "_leave_a_line", lambda projection, problem, inliers, sigma: inliers.any(-1)),
 }
 
 
