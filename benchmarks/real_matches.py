@@ -462,7 +462,7 @@ def draw_failure(matches: Matches, solved: Solved, at: int, folder: Path) -> dic
         axes.plot(*pixels[~fit].T, ".", color=GREY, markersize=2.5, label="pixels of other pairs")
         axes.plot(*pixels[fit].T, "o", color=BLUE, markersize=3.5, label=f"pixels within {INLIER_PX:g} px")
         axes.plot(*seen[fit].T, "+", color=ORANGE, markersize=6, label="their projections")
-        axes.set(title=f"{title}: {int(fit.sum())} of {len(fit)}", aspect="equal")
+        axes.set(title=f"{title}:\n{int(fit.sum())} of {len(fit)}", aspect="equal")
     axes.invert_yaxis()
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     name = f"real_failure_{matches.scene[at]}.png"

@@ -224,7 +224,6 @@ def test_integral_by_the_prior_alone():
 
 
 def test_hypotheses_find_other_modes():
-    """A second pose that explains the pairs as well adds its integral, if the samples find it."""
     p = problems(n=40, world_sigma=0.0, img_sigma=0.0)
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=DOUBLE))
     # Half of the pairs see the scene, the other half the scene turned upside down around its centre.

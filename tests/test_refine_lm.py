@@ -186,7 +186,6 @@ def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_
 
 @pytest.mark.parametrize(("backward", "least", "most"), [("unroll", 5.0, torch.inf), ("implicit", 0.0, 1.0)])
 def test_memory_of_the_backward_pass(backward, least, most, make_problems):
-    """Only unrolling keeps more tensors the more iterations there are."""
     p, sizes = make_problems(), {3: [], 30: []}
     img = p.img_points.clone().requires_grad_()
     for m, kept in sizes.items():

@@ -336,7 +336,6 @@ def test_a_data_loader_returns_results_and_loaded_weights_can_be_trained(name):
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac"])
 def test_results_without_gradients_can_be_used_where_gradients_are_recorded(name):
-    """Such calls run in inference mode, whose tensors cannot be saved for a backward pass."""
     solver, inputs = create_solver(name), SyntheticProblems(n=9, batch_size=40, seed=0).batch(0)[:3]
     result = solver(*inputs)
     assert not any(x.is_inference() for x in iter_tensors((result, result.covariance(*inputs))))

@@ -205,7 +205,6 @@ def test_sweeps_by_other_launchers(launcher, option, tmp_path):
 
 
 def test_an_interrupted_sweep_names_the_command_that_continues_it(tmp_path, train, monkeypatch):
-    """The folder of a sweep contains the time, and has to be passed."""
     write, command = History.write, ["-m", "model.n=6,9", f"hydra.sweep.dir={tmp_path}/a b", "train.updates=3"]
 
     def interrupt(self, row):
