@@ -64,11 +64,11 @@ def test_a_far_point_does_not_make_a_line_a_solid(length, random_rotations, gene
     rods[:, 0] *= torch.tensor([1.0, 1e3, 1e3]) * length
     solids = torch.randn(200, 9, 3, generator=generator).double()
     pose = Pose(random_rotations(200), torch.tensor([0.0, 0.0, 30.0]).double().expand(200, 3))
-    for points, share in ((rods, 0.03), (solids, 1.0)):
-        problem = Problem.of(points, points[..., :2], 1.0)
-        projection = project(State.of(pose), problem)
-        clear = _leave_a_line(projection, problem, torch.ones(200, 9).bool(), torch.full((200,), 1e-3))
-        assert abs(clear.double().mean() - share) <= (share < 1) * share
+    there, sigma = torch.ones(200, 9).bool(), torch.full((200,), 1e-3)
+    problems = [Problem.of(points, points[..., :2], 1.0) for points in (rods, solids)]
+    rod, solid = (_leave_a_line(project(State.of(pose), x), x, there, sigma) for x in problems)
+    assert rod.double().mean() < 0.03
+    assert solid.all()
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm", "pnpnet-n20"])
@@ -83,9 +83,9 @@ def test_doubtful_poses_are_not_ok_and_right_poses_of_tags_are(name):
             turn = pose_errors(result.pose, kind.truth).rotation_error_deg
         most = 0.4 if kind.name.startswith("20 pairs") else 0.05  # 20 pairs of a wrong convention often fit some pose
         assert (result.ok & (turn > 10.0)).double().mean() <= most, kind.name
-        if kind.name.startswith("tag of 20"):  # the mirror image of bearings, too
+        if kind.name.startswith("tag of 20") and name == "p3p-ransac":  # the mirror image of bearings, too
             rays = torch.nn.functional.pad(kind.img_points, (0, 1), value=1.0) @ INTRINSICS.inverse().mT
-            rays = create_solver("p3p-ransac")(kind.world_points, rays, INTRINSICS)
+            rays = create_solver(name)(kind.world_points, rays, INTRINSICS)
             assert (rays.ok & (pose_errors(rays.pose, kind.truth).rotation_error_deg > 10.0)).double().mean() <= 0.05
         if kind.name.startswith(("tag of 100", "tag of 400", "2 tags")) and name != "epnp-lm":
             assert result.ok[turn < 2.0].double().mean() >= 0.85, kind.name

@@ -34,9 +34,8 @@ class Server:
     def __call__(self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> PnPResult:
         """Wait for the result of one problem: (N, 3), (N, 2) and (3, 3)."""
         future: Future[PnPResult] = Future()
-        if [*map(len, (world_points.mT, img_points.mT, intrinsics))] != [3, 2, 3] or len(world_points) != len(
-            img_points
-        ):
+        pairs = len(world_points)
+        if (world_points.shape, img_points.shape, intrinsics.shape) != ((pairs, 3), (pairs, 2), (3, 3)):
             raise ValueError("expected shapes (N, 3), (N, 2) and (3, 3)")
         self.waiting.put(((world_points, img_points, intrinsics), future))
         return future.result()
@@ -54,7 +53,7 @@ class Server:
                 results = self.solver(*padded, torch.stack(cameras), mask=mask)
                 for i, (_, future) in enumerate(batch):
                     future.set_result(map_tensors(lambda x, i=i: x[i], results))
-            except Exception as error:  # a request of an incorrect shape must not end the thread
+            except Exception as error:  # no error may end the thread
                 for _, future in batch:
                     future.set_exception(error)
 

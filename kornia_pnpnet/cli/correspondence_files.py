@@ -17,8 +17,8 @@ from kornia_pnpnet.core.files import InputError, read_csv, read_npz
 from kornia_pnpnet.problem import MIN_PAIRS
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
-# Names that are refused, because users would expect an effect.
-_REFUSED = "mask", "confidence", "weight"
+# Names that are refused, because users would expect an effect: in CSV files, and in NPZ files.
+_REFUSED_COLUMNS, _REFUSED_ARRAYS = {"mask", "confidence", "weights"}, {"mask", "confidence", "weight"}
 
 
 class ImageCorrespondences(NamedTuple):
@@ -78,7 +78,7 @@ def read_correspondences(path: str | Path) -> ImageCorrespondences:
 def _read_csv(path: Path) -> ImageCorrespondences:
     rows: list[list[float]] = []
     for line, cells in read_csv(path, _COLUMNS, optional=("weight",)).items():
-        if refused := cells.keys() & {"mask", "confidence", "weights"}:
+        if refused := cells.keys() & _REFUSED_COLUMNS:
             raise InputError(path, f"the column {min(refused)} is not read: use weight, with 0 for pairs to ignore")
         rows.append([])
         for name in (*_COLUMNS, "weight"):
@@ -119,10 +119,10 @@ def _read_npz(path: Path) -> ImageCorrespondences:
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read the named arrays of an NPZ file. Raise ``InputError`` if ``world_points`` or ``img_points`` is missing."""
     try:
-        arrays = read_npz(path, (*names, *_REFUSED))
+        arrays = read_npz(path, {*names, *_REFUSED_ARRAYS})
     except ValueError as error:
         raise InputError(path, str(error)) from None
-    if refused := arrays.keys() & _REFUSED:
+    if refused := arrays.keys() & _REFUSED_ARRAYS:
         raise InputError(path, f"the array {min(refused)} is not read: use weights, with 0 for pairs to ignore")
     for name in ("world_points", "img_points"):
         if name not in arrays:
