@@ -28,6 +28,7 @@ The trainings of ``distribution.json`` take minutes::
 """
 
 import argparse
+import os
 from pathlib import Path
 
 from measure import HERE, OTHERS, RESULTS, compare, measure, ship
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--real-count", type=int, default=1000, help="problems of a scene")
     parser.add_argument("--runs", type=Path, nargs="+", help="folders: `mixed` and `paper` for compare, all for ship")
     arguments = parser.parse_args()
+    arguments.scenes = Path(os.path.relpath(arguments.scenes))  # results files name no folder of a machine
     if arguments.step == "measure":
         measure(arguments.scenes, arguments.synthetic_count, arguments.real_count, arguments.only)
     elif arguments.step == "compare":
