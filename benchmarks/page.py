@@ -23,9 +23,10 @@ PAGE = HERE.parent / "docs" / "performance.md"
 PARTS = ("throughput", "latency", "startup")
 #: Caches of the compiler at a start, or no compiler.
 COLD, CACHED, EAGER = "cold", "cached", "eager"
-#: Other libraries, and what the pictures show besides the solvers of ours that users call.
+#: Solvers of ours that users call, other libraries, and what the pictures show. Ours run in several ways: "NAME WAY".
+OURS = (TRAINED, ANY)
 PEERS = ("poselib", "pycolmap", "opencv-ransac", "kornia-rs")
-DRAWN = (*PEERS, "p3p-ransac", "kornia-dlt")
+DRAWN = (*OURS, *PEERS, "p3p-ransac", "kornia-dlt")
 
 Rows = Mapping[str, Row]  # by contender
 
@@ -33,11 +34,6 @@ Rows = Mapping[str, Row]  # by contender
 def matching(rows: Iterable[Row], **wanted: Any) -> dict[str, Row]:
     """Rows with these values, by contender."""
     return {row["contender"]: row for row in rows if wanted.items() <= row.items()}
-
-
-def is_whole(name: str) -> bool:
-    """Whether a contender is a solver of ours that users call, as shipped, in any way."""
-    return name.partition(" ")[0] in (TRAINED, ANY)
 
 
 def quickest(results: Row) -> list[dict[str, Any]]:
@@ -77,7 +73,7 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         settings=settings,
         **{"alone": alone, "two": matching(latency, threads=2), "many": many},
         first_calls=first_calls,
-        ours=[*filter(is_whole, alone)],
+        ours=[name for name in alone if name.partition(" ")[0] in OURS],
         peers=[name for name in PEERS if name in alone],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         gpu=gpu,
@@ -87,7 +83,8 @@ def page(results: Rows, gpu: Row | None = None) -> str:
 
 # Line styles by the end of a contender's name. Other names have a dashed line.
 _WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}
-_NOT_DRAWN = " compiled", " ONNX", "p3p-ransac"  # of the single calls, whose table has all contenders
+_NOT_ALONE = " compiled", " ONNX", "p3p-ransac"  # a picture has at most 8 curves, its table all contenders
+_NOT_BATCHED = " ONNX", "p3p-ransac", "opencv-ransac", "kornia-rs", "kornia-dlt"
 _LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowest
 
 
@@ -102,7 +99,7 @@ def plot_times(path: Path, title: str, panels: Mapping[str, Sequence[Row]], *, a
 @themed
 def plot_latency(path: Path, title: str, rows: Sequence[Row]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
-    rows = [row for row in rows if not row["contender"].endswith(_NOT_DRAWN)]
+    rows = [row for row in rows if not row["contender"].endswith(_NOT_ALONE)]
     looks = _looks(row["contender"] for row in rows)
     figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()
@@ -142,15 +139,14 @@ def render(folder: Path, path: Path) -> None:
     results, gpu = load_parts(folder)
 
     def drawn(part: str) -> list[Row]:
-        one_thread = [x for x in results[part]["rows"] if x["threads"] == 1]
-        return [x for x in one_thread if is_whole(x["contender"]) or x["contender"] in DRAWN]
+        return [x for x in results[part]["rows"] if x["threads"] == 1 and x["contender"].partition(" ")[0] in DRAWN]
 
     rows, alone = drawn("throughput"), drawn("latency")
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
-    batches = {mode: [row for row in rows if (row["mode"], row["n"]) == (mode, N)] for mode in (FORWARD, BACKWARD)}
-    forward = [row for row in rows if row["mode"] == FORWARD]
-    pairs = [row for row in forward if row["n"] == N and row["batch"] == size]
-    pairs += [row for row in forward if row["n"] != N and "compiled" not in row["contender"]]
+    some = [row for row in rows if row["n"] == N and not row["contender"].endswith(_NOT_BATCHED)]
+    batches = {mode: [row for row in some if row["mode"] == mode] for mode in (FORWARD, BACKWARD)}
+    kept = {row["contender"] for row in rows if row["n"] != N}
+    pairs = [x for x in rows if x["contender"] in kept and (x["n"] != N or (x["mode"], x["batch"]) == (FORWARD, size))]
     plot_times(pictures / "batch.png", "n = 9, 3 mismatches, one thread", batches, against="batch", label="problems B")
     fewer = "".join(f" ({b} at n = {n})" for n, b in sorted({(x["n"], x["batch"]) for x in pairs}) if b < size)
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
