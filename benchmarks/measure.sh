@@ -37,7 +37,7 @@ part scale benchmarks/scale.py --problems 10000000
 for name in fiducial_board incremental_map keypoint_offsets keypoint_pipeline localiser pose_network serve tracking; do
     part $name docs/examples/$name.py --out docs/examples
 done
-part keypoint_covariances docs/examples/keypoint_pipeline.py --covariances --seeds 2 --updates 600 --out docs/examples
+part keypoint_covariances docs/examples/keypoint_pipeline.py --covariances --updates 600 --out docs/examples
 
 if [ -n "${DATA:-}" ]; then
     part results docs/results/make.py measure --scenes "$DATA"

@@ -355,7 +355,7 @@ def plot_overlays(networks: dict[str, Keypoints], path: Path) -> None:
 
 
 def main() -> None:
-    parser = command(__doc__, seeds=3)
+    parser = command(__doc__, seeds=2)
     parser.add_argument("--updates", type=int, default=2000, help="of each half of the training")
     parser.add_argument("--batches", type=int, default=32, help="of test images")
     parser.add_argument("--covariances", action="store_true", help="compare kinds of noise; end to end half as long")
