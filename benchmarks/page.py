@@ -83,8 +83,7 @@ def page(results: Rows, gpu: Row | None = None) -> str:
 
 # Line styles by the end of a contender's name. Other names have a dashed line.
 _WAYS = {" compiled": "-", " compiled whole": ":", " ONNX": "-.", " packaged": ":"}
-_NOT_ALONE = " compiled", " ONNX", "p3p-ransac"  # a picture has at most 8 curves, its table all contenders
-_NOT_BATCHED = " ONNX", "p3p-ransac", "opencv-ransac", "kornia-rs", "kornia-dlt"
+_NOT_DRAWN = " compiled", " ONNX", "p3p-ransac"  # of the single calls, whose table has all contenders
 _LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowest
 
 
@@ -99,7 +98,7 @@ def plot_times(path: Path, title: str, panels: Mapping[str, Sequence[Row]], *, a
 @themed
 def plot_latency(path: Path, title: str, rows: Sequence[Row]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
-    rows = [row for row in rows if not row["contender"].endswith(_NOT_ALONE)]
+    rows = [row for row in rows if not row["contender"].endswith(_NOT_DRAWN)]
     looks = _looks(row["contender"] for row in rows)
     figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()
@@ -143,7 +142,7 @@ def render(folder: Path, path: Path) -> None:
 
     rows, alone = drawn("throughput"), drawn("latency")
     pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
-    some = [row for row in rows if row["n"] == N and not row["contender"].endswith(_NOT_BATCHED)]
+    some = [row for row in rows if row["n"] == N and not row["contender"].endswith(" ONNX")]
     batches = {mode: [row for row in some if row["mode"] == mode] for mode in (FORWARD, BACKWARD)}
     kept = {row["contender"] for row in rows if row["n"] != N}
     pairs = [x for x in rows if x["contender"] in kept and (x["n"] != N or (x["mode"], x["batch"]) == (FORWARD, size))]

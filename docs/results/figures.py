@@ -154,7 +154,7 @@ def draw_dots(path: str | Path, heading: Sequence[str], panels: Sequence[Panel])
 def draw_curves(
     path: str | Path, heading: Sequence[str], panels: Sequence[Panel], x: str, styles: Styles | None = None
 ) -> Path:
-    """Draw panels of curves against the column ``x``, with one legend below.
+    """Draw panels of curves against the column ``x``, of at most 8 solvers (``_FIRST`` first), with one legend below.
 
     A panel is a title, a table with the column ``solver``, and the name of the column on its vertical axis: ``rate`` in
     per cent (with ``low`` and ``high``), ``us`` or ``operations``. Panels with the same vertical axis share its limits.
