@@ -15,11 +15,11 @@ from kornia_pnpnet.arguments import checked_inputs, given_cameras, in_parts, res
 from kornia_pnpnet.core.checks import check_positive, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Runner, compiling, in_full_precision, in_turn, needs_graph, sees_values
-from kornia_pnpnet.core.trees import iter_tensors, map_tensors
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors, put
 from kornia_pnpnet.core.watch import GradientWatch
 from kornia_pnpnet.frame import Frame, Normalize
 from kornia_pnpnet.pretrained import PretrainedMixin
-from kornia_pnpnet.problem import Inputs, Problem, Starts
+from kornia_pnpnet.problem import Inputs, Problem, Starts, State
 from kornia_pnpnet.propose.alternatives import find_alternatives, reconsider
 from kornia_pnpnet.propose.first import propose
 from kornia_pnpnet.propose.focal import (
@@ -365,10 +365,10 @@ class PnPNet(PretrainedMixin):
         # Rigs are not searched, and an unknown focal length has another search.
         searches = adapts and self.focal == "known" and inputs.rig is None
         problem, frame, starts = self._run(self._propose, inputs, call, searches)
-        rival = replaced = found = odds = None
+        rivals = rival = replaced = found = odds = None
         if searches:
             keep_others = inputs.init is not None or inputs.prior is not None
-            starts, rival = search_on(problem, starts, keep_others=keep_others)
+            starts, rivals = search_on(problem, starts, keep_others=keep_others)
         seen = problem
         if inputs.radial is not None:
             seen = distorted(problem, inputs.radial)
@@ -379,6 +379,8 @@ class PnPNet(PretrainedMixin):
         plan, now = self.refine.iterate(plan, 0 if call.first_stage_only else None, more=more, run=self._run)
         if compares:
             found = plan.evidence_at(now.state)
+            if rivals is not None:
+                rival = State.of(put(now.state.pose, *rivals))
             if nominal and adapts:
                 doubted = frame.valid & ~self.refine.judge(plan, now, found).ok
                 rival, replaced = find_focal(problem, now.state, doubted)

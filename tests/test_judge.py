@@ -203,7 +203,7 @@ def test_the_right_pose_of_a_board_is_among_them(name, generator):
 
 
 def test_a_pose_is_not_believed_beside_its_mirror_image(generator):
-    *given, pose = boards(generator, batch=300, sigma=0.7, dtype=torch.float32)
+    *given, pose = boards(generator, batch=1000, sigma=0.7, dtype=torch.float32)
     believed = {}
     for effort in ("fixed", "adaptive"):
         result = create_solver("pnpnet-set", effort=effort)(*given)

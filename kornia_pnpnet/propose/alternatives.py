@@ -155,9 +155,9 @@ def reconsider(
         return now, found, torch.full_like(found.log_ratio, torch.inf)
     state, mixture = problems_last(map_tensors(lambda *x: torch.stack(x)[kind, owners], *kinds))
     every = taken(plan._replace(state=now.state, starts=1), owners)
-    # The last kind is a given rival, which starts with the noise of its own residuals.
-    given = kind[:, None] == len(kinds) - 1
-    mixture = map_tensors(lambda x, y: torch.where(given, x, y), every.evidence_at(state).mixture, mixture)
+    if apart.any():  # the last kind is a given rival, which starts with the noise of its own residuals
+        given = kind[:, None] == len(kinds) - 1
+        mixture = map_tensors(lambda x, y: torch.where(given, x, y), every.evidence_at(state).mixture, mixture)
     tried = Progress.of(state, mixture)
     step, damping, _ = plan.hyperparameters[-1]
     for i in range(_FROZEN + _FREE):

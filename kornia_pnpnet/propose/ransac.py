@@ -10,18 +10,22 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import compiling, problems_last, sees_values
-from kornia_pnpnet.core.trees import map_tensors, put
+from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.judge.inliers import Judged, Thresholds, judge
-from kornia_pnpnet.problem import LEAST_NOISE, Problem, Starts, State
+from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.minimal import MinimalSolver, describe
 from kornia_pnpnet.propose.p3p import P3P
+from kornia_pnpnet.propose.sampling import samples_needed
 from kornia_pnpnet.propose.scoring import SCORERS, Scorer, as_pose
-from kornia_pnpnet.propose.search import Search, cauchy_scale, least_squares
+from kornia_pnpnet.propose.search import Search, are_open, cauchy_scale, least_squares
 from kornia_pnpnet.refine.residual import Projection, project
 from kornia_pnpnet.result import Pose
 
-__all__ = ["RANSAC", "search_on"]
+__all__ = ["RANSAC", "Rivals", "search_on"]
+
+#: Poses to compare with the refined poses: indices of problems (R,), and one pose for each of these problems.
+Rivals = tuple[Tensor, Pose]
 
 # A pose can fit this number of inliers closely even if the pixels are noisy.
 _FITTED = 5
@@ -201,11 +205,12 @@ def _trusted(problem: Problem) -> Tensor:
 
 
 @torch.no_grad()
-def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, State]:
+def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, Rivals | None]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    Least squares improve the best pose of the starts. A problem is searched only if the inliers of the improved pose
-    require over 64 samples for a confidence of 0.999. Let :math:`w` be the weight of a pair in the starts. The chance
+    The inliers of the last pose of the starts decide whether a problem is searched: if they require over 64 samples for
+    a confidence of 0.999, or if the pose is open (see ``are_open`` in :mod:`kornia_pnpnet.propose.search`). All poses
+    of the starts compete with the poses of the samples. Let :math:`w` be the weight of a pair in the starts. The chance
     of drawing this pair is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
     A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
@@ -220,8 +225,8 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
 
     Returns:
         First, the starts with the best pose, without gradient. In a searched problem, a Cauchy kernel at the best pose
-        gives the weights. The kernel's scale is the inlier threshold. Second, the pose with the least loss at wider
-        thresholds, for the comparison with the refined pose (see `reconsider`).
+        gives the weights. The kernel's scale is the inlier threshold. Second, the pose of each searched problem with
+        the least loss at wider thresholds, for the comparison with the refined pose (see `reconsider`).
 
     Raises:
         ValueCheckError: when the starts have no noise.
@@ -242,14 +247,20 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
         limit = torch.where(is_known, sigma.new_full((), _KNOWN_INLIER), _INLIER) * sigma
     thresholds = Thresholds(limit, torch.zeros_like(depth))
     chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
-    given = map_tensors(lambda *x: torch.stack(x, 1), *constant.poses)
-    search = Search(_FURTHER, problem, thresholds, chances, sigma, finds_rivals=True, ranks=True)
-    drawn = search.run(given, enough=_FURTHER.min_samples)
-    state, weights = search.state, constant.weights
-    if len(drawn):
-        judged = judge(project(state, problems_last(problem)), problem, thresholds)
-        weights = put(weights, drawn, 1.0 / (1.0 + judged.errors[drawn]))
+    pose, weights, pairs = constant.poses[-1], constant.weights, problems_last(problem)
+    projection = project(State.of(pose), pairs)
+    inliers = judge(projection, pairs, thresholds).weights > 0
+    number, count = (x.sum(-1, dtype=torch.float64) for x in (inliers, problem.weights > 0))
+    needed = samples_needed(number, count, MIN_PAIRS, _FURTHER.confidence)
+    doubted = (needed > _FURTHER.min_samples) | are_open(projection, pairs, inliers, sigma)
+    rows, rivals = doubted.nonzero()[:, 0], None
+    if len(rows):
+        given = map_tensors(lambda *x: torch.stack(x, 1), *take(constant.poses, rows))
+        some, limits, chances, sigma = take((problem, thresholds, chances, sigma), rows)
+        search = Search(_FURTHER, some, limits, chances, sigma, finds_rivals=True, ranks=True)
+        search.run(given)
+        rivals = rows, map_tensors(lambda x: x.to(problem.weights), as_pose(search.rivals))
+        errors = judge(project(search.state, problems_last(some)), some, limits).errors
+        pose, weights = put((pose, weights), rows, (search.state.pose, 1.0 / (1.0 + errors)))
     others = starts.others if keep_others else None
-    rival = map_tensors(lambda x: x.to(problem.weights), as_pose(search.rivals))
-    starts = starts._replace(pose=state.pose, others=others, weights=weights, camera=state.camera)
-    return starts, State.of(rival)
+    return starts._replace(pose=pose, others=others, weights=weights), rivals

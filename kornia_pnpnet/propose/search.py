@@ -22,7 +22,7 @@ from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, p
 from kornia_pnpnet.refine.terms import add_term
 from kornia_pnpnet.result import Pose
 
-__all__ = ["CAUCHY", "Search", "cauchy_scale", "least_squares"]
+__all__ = ["CAUCHY", "Search", "are_open", "cauchy_scale", "least_squares"]
 
 #: Scale of the Cauchy kernel in standard deviations.
 CAUCHY = 3.4
@@ -58,9 +58,9 @@ _WIDER = 16.0
 _FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step. The damping is small, because the start is close to the minimum.
 _DAMPING = 1e-6
-# If `pose_sigma` exceeds _OPEN, at least _OPEN_SAMPLES samples are drawn, because an incorrect pose may have as many
-# inliers as the correct pose. An example is a flat scene in a narrow field of view.
-_OPEN, _OPEN_SAMPLES = 0.06, 256.0
+# If `pose_sigma` exceeds _OPEN, at least _OPEN_SAMPLES samples are drawn, see `are_open`. Fewer than _OPEN_PAIRS pairs
+# do not have this number of samples.
+_OPEN, _OPEN_SAMPLES, _OPEN_PAIRS = 0.06, 256.0, 13
 # Solving _PLAIN_SAMPLES samples takes as long as `agreement_of_neighbours`. After these samples, the chance of each
 # pair is multiplied by (a + agreement)^b. The numbers a = _LEAST_AGREEMENT and b = _AGREEMENT_POWER are empirical.
 _PLAIN_SAMPLES = 256
@@ -147,16 +147,10 @@ class Search:
         rotation = torch.where(is_rotation, rotation, torch.eye(3, dtype=rotation.dtype, device=rotation.device))
         return State(Pose(rotation, pose.translation), camera)
 
-    def run(self, given: Pose | None = None, enough: float = -1.0) -> Tensor:
+    def run(self, given: Pose | None = None) -> None:
         """Search each problem until its samples suffice for the plan's confidence, or until all samples are drawn.
 
-        Args:
-            given: poses that compete with the poses of the samples, :math:`(B, S, 3, 3)` and :math:`(B, S, 3)`.
-            enough: number of samples. A problem with given poses is searched only if the inliers of its best pose
-                require more samples.
-
-        Returns:
-            The batch indices of the problems from which samples were drawn.
+        The poses ``given``, (B, S, 3, 3) and (B, S, 3), compete with the poses of the samples.
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
@@ -166,13 +160,7 @@ class Search:
             valid = torch.ones_like(poses[:, 0], dtype=torch.bool)
             losses, poses = self._compared(active, take(self.scene, active), poses, valid)
             self.loss[active], self.poses[active] = losses[:, 0], poses[..., 0]
-            self._expect(active)
-            hard = self.needed[active] > enough
-            active = active[hard]
-            self._improve(active, losses[hard], poses[hard])
-            self._expect(active)
-            active = active[self.needed[active] > enough]
-        drawn, start, stop = active, 0, 0
+        start, stop = 0, 0
         while len(active):
             if start < _PLAIN_SAMPLES <= stop and self.problem.rig is None:
                 self._prefer_agreement(active)
@@ -185,7 +173,6 @@ class Search:
             if len(active):
                 self._draw(active, start, stop)
                 active = active[self.needed[active].clamp(min=self.plan.min_samples) > stop]
-        return drawn
 
     def run_once(self, positions: Tensor, judges: Tensor) -> None:
         """Search in one round of given samples. No shape depends on values, as compiled and exported graphs require.
@@ -253,8 +240,7 @@ class Search:
             needed = (needed * self.plain.needed(at, inliers, self.plan.confidence)).sqrt()
         if self.problem.free_focal is None:
             sigma = residual_noise(projection, problem, judged.weights).img if self.sigma is None else self.sigma[rows]
-            precision = (judged.weights > 0) / sigma.square()
-            is_open = pose_sigma(projection, problem, precision)[: len(at)] > _OPEN
+            is_open = are_open(projection, problem, judged.weights > 0, sigma)[: len(at)]
             needed = torch.where(is_open, needed.clamp(min=_OPEN_SAMPLES), needed)
         self.needed[at] = needed
 
@@ -270,7 +256,8 @@ class Search:
         losses, poses = map_tensors(lambda *x: torch.cat(x), *(self._round(x, start, stop) for x in parts))
         better = losses[:, 0] < self.loss[problems]
         self._improve(problems[better], losses[better], poses[better])
-        self._expect(problems[better & (self.samples.totals[problems] > stop)])
+        changed = better if start else self.loss[problems].isfinite()
+        self._expect(problems[changed & (self.samples.totals[problems] > stop)])
 
     def _round(self, problems: Tensor, start: int, stop: int) -> tuple[Tensor, Tensor]:
         """Find the best poses of samples ``start`` to ``stop - 1``: ascending losses (P, K) and entries (P, 12, K).
@@ -375,6 +362,18 @@ def least_squares(problem: Problem, projection: Projection, weights: Tensor, var
         equations = add_term(equations, term.linearise(projection.state), projection.focal)
     delta, _ = solve_positive(equations.matrix, equations.gradient, weights.new_full((), _DAMPING))
     return moved(projection.state, delta / -projection.focal)
+
+
+def are_open(projection: Projection, problem: Problem, inliers: Tensor, sigma: Tensor) -> Tensor:
+    """Whether the inliers (B, N) determine the pose poorly, bool (B,). ``sigma`` is the noise of the pixels.
+
+    An incorrect pose may then have as many inliers as the correct pose, for example if the camera sees a flat scene in
+    a narrow field of view. More samples find more such poses. A problem with few possible samples is never open.
+    """
+    enough = (problem.weights > 0).sum(-1) >= _OPEN_PAIRS
+    if inliers.shape[1] < _OPEN_PAIRS:
+        return enough
+    return enough & (pose_sigma(projection, problem, inliers / sigma.square()) > _OPEN)
 
 
 def cauchy_scale(sq_residuals: Tensor, there: Tensor, fitted: int = MIN_PAIRS) -> Tensor:

@@ -348,7 +348,7 @@ class SetInit(Initialiser):
 
         Returns:
             The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
-            last hypothesis is the best pose of the samples.
+            last hypothesis is the best pose of the samples. If a search follows, it is the best pose of all.
 
         Raises:
             DeviceError: when the problem and the network are on different devices.
@@ -380,21 +380,26 @@ class SetInit(Initialiser):
         noises = self._noise(given, view, noise)
         if self.samples:
             visible = noises if index is None else _taken(noises, index)
-            poses.append(self._sampled(problem, chances, visible, poses[0], search_follows))
+            poses.append(self._sampled(problem, chances, visible, poses, search_follows))
         if index is not None:
             probability = _agreement(given, noises, poses[-1]).scatter(1, index, probability)
         return Starts(poses[0], probability, noise=noises).with_others(*poses[1:])
 
     @torch.no_grad()
-    def _sampled(self, problem: Problem, chances: Tensor, noise: Noise, fallback: Pose, search_follows: bool) -> Pose:
-        """Find the best-scoring pose of all samples, or return ``fallback`` if no sample has a valid pose."""
+    def _sampled(
+        self, problem: Problem, chances: Tensor, noise: Noise, others: Sequence[Pose], search_follows: bool
+    ) -> Pose:
+        """Find the best-scoring pose of all samples, or return ``others[0]`` if no sample has a valid pose.
+
+        If a search follows, the ``others`` compete with the poses of the samples.
+        """
         batch, count = chances.shape
         there = problem.usual_weights > 0
         # Unlikely pairs also contribute to scores, because they can be inliers.
         vote = torch.add((1.0 - _LEAST_VOTE) * chances, there, alpha=_LEAST_VOTE)
         # The variance is computed at the depth of the network's pose. At the depth of a hypothesis close to the points,
         # the variance would be large, and most pairs would agree with the hypothesis.
-        precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, fallback))
+        precision = problem.focal.square() / (_JUDGED * _variance(noise, problem.focal, others[0]))
         plane_points, scoring = problem.img_points / problem.focal, (vote[..., None], precision[..., None])
         of_pairs = torch.cat((problem.world_points, plane_points, *scoring), -1)  # (B, N, 7)
         if not isinstance(count, int):  # exported for any number of pairs: append padding
@@ -421,13 +426,16 @@ class SetInit(Initialiser):
         if batch and len(valid) > _MANY_SLOTS and valid.device.type == "cpu" and sees_values(valid):
             slots = present_first(valid.mT)[:, : max(int(valid.sum(0).max()), 1)].mT
             entries, valid = entries.gather(1, slots.expand(12, -1, -1)), valid.gather(0, slots)
+        if search_follows:
+            entries = torch.cat((entries, torch.stack([as_entries(pose).mT for pose in others], 1)), 1)
+            valid = torch.cat((valid, valid.new_ones(len(others), batch)))
         support = _support(entries.unflatten(0, (3, 4)), pairs)
         valid = valid & (support > 0)
         for term in problem.pose_terms:
             support = support - term.disagreement(as_pose(entries.permute(1, 2, 0)))
         score, best = torch.where(valid, support, -torch.inf).max(0)
         chosen = entries.gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
-        return as_pose(torch.where((score > -torch.inf)[:, None], chosen, as_entries(fallback)))
+        return as_pose(torch.where((score > -torch.inf)[:, None], chosen, as_entries(others[0])))
 
     def _run(self, view: _View) -> tuple[Tensor, Tensor]:
         """The network's outputs per pair (1 + 2 S, B, N) and per problem (B, S + 2), for S ``starts``."""
