@@ -89,14 +89,15 @@ class PnPNet(PretrainedMixin):
             ``prior``, or from the identity if the call has neither.
         refine: the refiner. ``None``: a classical :class:`~kornia_pnpnet.refine.lm.RobustWeightedLM`.
         normalize: the normalisation; the default centres and scales the world and sorts the pairs.
-        effort: ``"adaptive"``: a problem gets further minimal samples if the poses of the initialiser explain too few
-            pairs (see :func:`~kornia_pnpnet.propose.ransac.search_on`). The initialiser must estimate the noise, as
-            :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every problem gets the same work. ``None``:
-            in evaluation mode, the effort is adaptive if the initialiser estimates the noise and the refinement has
-            iterations. Unless the effort is ``"fixed"``, the data affect two more steps. In evaluation mode, poses are
-            compared with other poses (see :func:`~kornia_pnpnet.propose.alternatives.reconsider`). For rigs and
-            bearings, RANSAC chooses the number of its samples. The effort is always fixed in exported graphs, with
-            ``compile(whole=True)``, in ``torch.func.vmap`` and on the device ``meta``.
+        effort: ``"adaptive"``: a problem gets further minimal samples if the most promising pose of the initialiser
+            explains too few pairs or is determined poorly (see :func:`~kornia_pnpnet.propose.ransac.search_on`). The
+            initialiser must estimate the noise, as :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every
+            problem gets the same work. ``None``: in evaluation mode, the effort is adaptive if the initialiser
+            estimates the noise and the refinement has iterations. Unless the effort is ``"fixed"``, the data affect two
+            more steps. In evaluation mode, poses are compared with other poses (see
+            :func:`~kornia_pnpnet.propose.alternatives.reconsider`). For rigs and bearings, RANSAC chooses the number of
+            its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in
+            ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If no problem of the
             first batches is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems, but the
             gradients of a problem's loss with respect to normalised inputs are limited to a norm of 10. To train a
@@ -367,7 +368,7 @@ class PnPNet(PretrainedMixin):
         problem, frame, starts = self._run(self._propose, inputs, call, searches)
         rivals = rival = replaced = found = odds = None
         if searches:
-            keep_others = inputs.init is not None or inputs.prior is not None
+            keep_others = inputs.init is not None or inputs.prior is not None or self.views > 1
             starts, rivals = search_on(problem, starts, keep_others=keep_others)
         seen = problem
         if inputs.radial is not None:

@@ -1,7 +1,4 @@
-"""Laws that every solver keeps, written once: ``test_laws.py`` runs them over solvers, cameras, noise and dtypes.
-
-Each law compares the call that :func:`make` draws for a :class:`Case` with a changed call.
-"""
+"""Laws of all solvers, run by ``test_laws.py``. Each compares the call that :func:`make` draws with a changed call."""
 
 import copy
 import math

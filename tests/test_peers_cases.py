@@ -1,7 +1,6 @@
 """Our solvers on the cases of other libraries' public test suites, beside those libraries, and on wild pairs.
 
-Problems are drawn from the parameters of the suites. The success of each of our solvers must not be lower than that of
-the best library by more than a margin.
+Problems have the parameters of the suites. Each of our solvers succeeds as often as the best library, less a margin.
 """
 
 import math

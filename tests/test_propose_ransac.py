@@ -346,11 +346,10 @@ def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
     for n, outliers in ((6, 0), (9, 3), (40, 28)):
         problems = make_problems(n, 100, outliers=outliers)
         assert solver(**PROTOCOL)(*problems[:3]).ok.double().mean() > 0.97
-    for n in (4, 5, 9, 40):
+    for n, options in itertools.product((4, 5, 9, 40), (PROTOCOL, {"threshold": 4.0})):
         mix = OutlierMix(count=n, mismatch_share=0.0)
         problems = SyntheticProblems(n=n, batch_size=100, outliers=mix, dtype=torch.float64).batch(0)
-        for options in (PROTOCOL, {"threshold": 4.0}):
-            assert solver(**options)(*problems[:3]).ok.double().mean() <= 0.01
+        assert solver(**options)(*problems[:3]).ok.double().mean() <= 0.01
 
 
 def test_the_gradient_is_that_of_the_result(make_problems, generator):
@@ -383,3 +382,14 @@ def test_rivals_are_more_accurate_if_the_noise_exceeds_the_threshold():
     poses = [frame.undo(as_pose(x)) for x in (search.poses, search.rivals)]
     best, rival = (pose_errors(pose, problems.pose).rotation_error_deg.median() for pose in poses)
     assert rival < 0.9 * best
+
+
+def test_only_doubtful_problems_are_searched(monkeypatch, make_problems):
+    monkeypatch.delattr(Search, "run")
+    far = Pose(torch.eye(3).double().expand(4, 3, 3), torch.ones(4, 3).double())
+    for n, given in itertools.product((9, 40), ({}, {"init": far})):
+        world, *rest = make_problems(n, 4, outliers=n // 5)[:3]
+        world[1] = torch.nan
+        assert create_solver("pnpnet-set")(world, *rest, **given).ok.tolist() == [True, False, True, True]
+    with pytest.raises(AttributeError, match="run"):
+        create_solver("pnpnet-set")(*make_problems(40, 4, outliers=30)[:3])

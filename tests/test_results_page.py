@@ -424,8 +424,7 @@ def test_counts_do_not_depend_on_the_data(name, make_problems):
 def test_ransac_draws_more_samples_with_more_outliers_and_more_confidence():
     solver = create_solver("p3p-ransac")
     counts = [operation_count(solver, 30, outliers=k) for k in (12, 15, 18)]  # with fewer the smallest number suffices
-    assert counts == sorted(counts)
-    assert counts[0] < 0.5 * counts[-1]
+    assert 2.0 * counts[0] < counts[2] > counts[1] > counts[0]
     assert operation_count("p3p-ransac:confidence=0.9", 30, outliers=18) < 0.8 * counts[-1]
 
 

@@ -122,7 +122,7 @@ def reconsider(
         now: the refined poses.
         found: the evidence for the refined poses.
         valid: whether a problem is valid, bool, shape :math:`(B,)`.
-        rival: given rivals, for example of ``search_on``, or ``None``.
+        rival: given rivals, for example of ``search_on``, or ``None``. A rival that equals the refined pose is ignored.
         replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. Given rivals that do not
             replace a pose are ignored. ``None``: given rivals compete by their likelihoods.
 

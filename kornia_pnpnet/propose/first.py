@@ -64,8 +64,9 @@ def propose(
         starts = from_views(init, problem, views, order)
     else:
         starts = init(problem, search_follows=True) if search_follows else init(problem)
-    if given is not None:
-        starts = starts.with_others(given)._replace(ok=None)
+    if given is not None:  # the initialiser's last pose stays the last, see `Initialiser.estimates_noise`
+        more = starts.poses[1:]
+        starts = starts._replace(ok=None, others=None).with_others(*more[:-1], given, *more[-1:])
     if trait(init, "weighs_unusual"):
         return starts
     known, limit = problem.map(torch.Tensor.detach), (_SEEN * problem.focal) ** 2

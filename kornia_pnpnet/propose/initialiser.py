@@ -25,7 +25,7 @@ class Initialiser(Configured):
         takes_rigs: whether the initialiser solves rigs.
         finds_focal: whether the initialiser estimates an unknown focal length.
         estimates_noise: whether the result contains the noise. Such an initialiser accepts
-            ``forward(problem, search_follows=True)``, and then returns the most promising pose last.
+            ``forward(problem, search_follows=True)``, and then its last pose is the most promising.
         weighs_unusual: whether the weights of unusual pairs (``Problem.usual``) are final. If not, `propose` sets them.
     """
 

@@ -22,10 +22,7 @@ from kornia_pnpnet.propose.search import Search, are_open, cauchy_scale, least_s
 from kornia_pnpnet.refine.residual import Projection, project
 from kornia_pnpnet.result import Pose
 
-__all__ = ["RANSAC", "Rivals", "search_on"]
-
-#: Poses to compare with the refined poses: indices of problems (R,), and one pose for each of these problems.
-Rivals = tuple[Tensor, Pose]
+__all__ = ["RANSAC", "search_on"]
 
 # A pose can fit this number of inliers closely even if the pixels are noisy.
 _FITTED = 5
@@ -205,13 +202,16 @@ def _trusted(problem: Problem) -> Tensor:
 
 
 @torch.no_grad()
-def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) -> tuple[Starts, Rivals | None]:
+def search_on(
+    problem: Problem, starts: Starts, *, keep_others: bool = False
+) -> tuple[Starts, tuple[Tensor, Pose] | None]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
-    The inliers of the last pose of the starts decide whether a problem is searched: if they require over 64 samples for
-    a confidence of 0.999, or if the pose is open (see ``are_open`` in :mod:`kornia_pnpnet.propose.search`). All poses
-    of the starts compete with the poses of the samples. Let :math:`w` be the weight of a pair in the starts. The chance
-    of drawing this pair is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
+    A problem is searched only if the inliers of the last pose of the starts require over 64 samples for a confidence of
+    0.999, or if they determine the pose poorly (see ``are_open`` in :mod:`kornia_pnpnet.propose.search`). In the
+    search, all poses of the starts compete with the poses of the samples. Let :math:`w` be the weight of a pair in the
+    starts. The chance of drawing this pair is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller
+    increases the chance.
 
     A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
     limit is five standard deviations. If the caller gave no noise, the standard deviation of every pair is the mean of
@@ -220,13 +220,16 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
 
     Args:
         problem: normalised problems of a centred and scaled world.
-        starts: poses of each problem, and the noise of the pairs. Weights are probabilities that pairs are inliers.
+        starts: poses of each problem, the most promising pose last, and the noise of the pairs. Weights are
+            probabilities that pairs are inliers.
         keep_others: whether to keep the other poses of the starts. With few pairs, the best pose can be incorrect.
 
     Returns:
-        First, the starts with the best pose, without gradient. In a searched problem, a Cauchy kernel at the best pose
-        gives the weights. The kernel's scale is the inlier threshold. Second, the pose of each searched problem with
-        the least loss at wider thresholds, for the comparison with the refined pose (see `reconsider`).
+        First, the starts with the best pose of the search, without gradient. If a problem is not searched, the last
+        pose takes this place (unless all poses are kept). In a searched problem, a Cauchy kernel at the best pose gives
+        the weights. The kernel's scale is the inlier threshold. Second, the indices of the searched problems and their
+        poses with the least loss at wider thresholds, for the comparison with the refined poses (see `reconsider`).
+        ``None``: no problem is searched.
 
     Raises:
         ValueCheckError: when the starts have no noise.
@@ -247,19 +250,19 @@ def search_on(problem: Problem, starts: Starts, *, keep_others: bool = False) ->
         limit = torch.where(is_known, sigma.new_full((), _KNOWN_INLIER), _INLIER) * sigma
     thresholds = Thresholds(limit, torch.zeros_like(depth))
     chances = (_DOUBT + (1.0 - _DOUBT) * constant.weights) * _trusted(problem)
-    pose, weights, pairs = constant.poses[-1], constant.weights, problems_last(problem)
-    projection = project(State.of(pose), pairs)
-    inliers = judge(projection, pairs, thresholds).weights > 0
-    number, count = (x.sum(-1, dtype=torch.float64) for x in (inliers, problem.weights > 0))
-    needed = samples_needed(number, count, MIN_PAIRS, _FURTHER.confidence)
+    last, weights, pairs = constant.poses[-1], constant.weights, problems_last(problem)
+    projection = project(State.of(last), pairs)
+    inliers, count = judge(projection, pairs, thresholds).weights > 0, (problem.weights > 0).sum(-1)
+    needed = samples_needed(inliers.sum(-1), count, MIN_PAIRS, _FURTHER.confidence)
     doubted = (needed > _FURTHER.min_samples) | are_open(projection, pairs, inliers, sigma)
-    rows, rivals = doubted.nonzero()[:, 0], None
+    rows, rivals = (doubted & (count >= MIN_PAIRS)).nonzero()[:, 0], None
+    pose = constant.pose if keep_others else last
     if len(rows):
         given = map_tensors(lambda *x: torch.stack(x, 1), *take(constant.poses, rows))
         some, limits, chances, sigma = take((problem, thresholds, chances, sigma), rows)
         search = Search(_FURTHER, some, limits, chances, sigma, finds_rivals=True, ranks=True)
         search.run(given)
-        rivals = rows, map_tensors(lambda x: x.to(problem.weights), as_pose(search.rivals))
+        rivals = rows, as_pose(search.rivals.to(problem.weights))
         errors = judge(project(search.state, problems_last(some)), some, limits).errors
         pose, weights = put((pose, weights), rows, (search.state.pose, 1.0 / (1.0 + errors)))
     others = starts.others if keep_others else None

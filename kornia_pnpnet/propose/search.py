@@ -59,7 +59,7 @@ _FAR_FROM_ROTATION = 0.1
 # Relative damping of a least-squares step. The damping is small, because the start is close to the minimum.
 _DAMPING = 1e-6
 # If `pose_sigma` exceeds _OPEN, at least _OPEN_SAMPLES samples are drawn, see `are_open`. Fewer than _OPEN_PAIRS pairs
-# do not have this number of samples.
+# have fewer samples of three pairs.
 _OPEN, _OPEN_SAMPLES, _OPEN_PAIRS = 0.06, 256.0, 13
 # Solving _PLAIN_SAMPLES samples takes as long as `agreement_of_neighbours`. After these samples, the chance of each
 # pair is multiplied by (a + agreement)^b. The numbers a = _LEAST_AGREEMENT and b = _AGREEMENT_POWER are empirical.
@@ -256,6 +256,7 @@ class Search:
         losses, poses = map_tensors(lambda *x: torch.cat(x), *(self._round(x, start, stop) for x in parts))
         better = losses[:, 0] < self.loss[problems]
         self._improve(problems[better], losses[better], poses[better])
+        # After the first round, the number of samples is also unknown where a given pose stayed the best.
         changed = better if start else self.loss[problems].isfinite()
         self._expect(problems[changed & (self.samples.totals[problems] > stop)])
 
@@ -368,7 +369,7 @@ def are_open(projection: Projection, problem: Problem, inliers: Tensor, sigma: T
     """Whether the inliers (B, N) determine the pose poorly, bool (B,). ``sigma`` is the noise of the pixels.
 
     An incorrect pose may then have as many inliers as the correct pose, for example if the camera sees a flat scene in
-    a narrow field of view. More samples find more such poses. A problem with few possible samples is never open.
+    a narrow field of view. More samples find more such poses. With fewer than 13 pairs, no pose is open.
     """
     enough = (problem.weights > 0).sum(-1) >= _OPEN_PAIRS
     if inliers.shape[1] < _OPEN_PAIRS:

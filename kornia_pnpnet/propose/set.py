@@ -348,7 +348,8 @@ class SetInit(Initialiser):
 
         Returns:
             The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
-            last hypothesis is the best pose of the samples. If a search follows, it is the best pose of all.
+            last hypothesis is the best pose of the samples. If a search follows, the poses of the network compete
+            with the poses of the samples, and the last hypothesis is the winner.
 
         Raises:
             DeviceError: when the problem and the network are on different devices.
