@@ -262,8 +262,8 @@ def search_on(
         some, limits, chances, sigma = take((problem, thresholds, chances, sigma), rows)
         search = Search(_FURTHER, some, limits, chances, sigma, finds_rivals=True, ranks=True)
         search.run(given)
-        rivals = rows, as_pose(search.rivals.to(problem.weights))
-        errors = judge(project(search.state, problems_last(some)), some, limits).errors
-        pose, weights = put((pose, weights), rows, (search.state.pose, 1.0 / (1.0 + errors)))
+        state, rivals = search.state, (rows, as_pose(search.rivals.to(problem.weights)))
+        errors = judge(project(state, problems_last(some)), some, limits).errors
+        pose, weights = put((pose, weights), rows, (state.pose, 1.0 / (1.0 + errors)))
     others = starts.others if keep_others else None
     return starts._replace(pose=pose, others=others, weights=weights), rivals
