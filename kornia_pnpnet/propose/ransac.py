@@ -208,10 +208,9 @@ def search_on(
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
     A problem is searched only if the inliers of the last pose of the starts require over 64 samples for a confidence of
-    0.999, or if they determine the pose poorly (see ``are_open`` in :mod:`kornia_pnpnet.propose.search`). In the
-    search, all poses of the starts compete with the poses of the samples. Let :math:`w` be the weight of a pair in the
-    starts. The chance of drawing this pair is proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller
-    increases the chance.
+    0.999, or if they determine the pose poorly (see ``are_open``). In the search, all poses of the starts compete with
+    the poses of the samples. Let :math:`w` be the weight of a pair in the starts. The chance of drawing this pair is
+    proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
     A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
     limit is five standard deviations. If the caller gave no noise, the standard deviation of every pair is the mean of
