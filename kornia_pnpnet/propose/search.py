@@ -369,7 +369,7 @@ def are_open(projection: Projection, problem: Problem, inliers: Tensor, sigma: T
     """Whether the inliers (B, N) determine the pose poorly, bool (B,). ``sigma`` is the noise of the pixels.
 
     An incorrect pose may then have as many inliers as the correct pose, for example if the camera sees a flat scene in
-    a narrow field of view. More samples find more such poses. With fewer than 13 pairs, no pose is open.
+    a narrow field of view. More samples find more such poses. With fewer than `_OPEN_PAIRS`, no pose is open.
     """
     enough = (problem.weights > 0).sum(-1) >= _OPEN_PAIRS
     if inliers.shape[1] < _OPEN_PAIRS:
