@@ -312,8 +312,8 @@ class PnPResult(NamedTuple):
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
         ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the pose, weights,
             cost, ``intrinsics`` and ``dist`` are finite, but have a gradient only with ``gradient="always"``.
-        init: the first guess. The first guess of every valid problem has a gradient. An initialiser can thus learn even
-            if the refinement fails.
+        init: the first guess. Unless a search or RANSAC for rigs found it, the first guess of every valid problem has a
+            gradient. An initialiser can thus learn even if the refinement fails.
         status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
         probability: estimated probability that the rotation error is at most 10 degrees, and the translation error at
             most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. Solvers of other

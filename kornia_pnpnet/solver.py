@@ -198,9 +198,10 @@ class PnPNet(PretrainedMixin):
             weights: weight of each pair, for both u and v, at least 0, shape :math:`(B, N)`; ``None``: 1.
             mask: False where a pair is padding, bool, shape :math:`(B, N)`. The values of padding are ignored.
             init: a world-to-camera pose, :math:`(B, 3, 3)` and :math:`(B, 3)`, that is refined in addition to the poses
-                of the initialiser. Without an initialiser the refinement starts from ``init`` alone. The matrices of
-                ``init``, ``prior`` and ``cam_from_rig`` are replaced by the nearest rotations. ``init`` is ignored if
-                it is not finite, or if the determinant of its matrix is not positive.
+                of the initialiser; in RANSAC it competes with the poses of the samples. Without an initialiser the
+                refinement starts from ``init`` alone. The matrices of ``init``, ``prior`` and ``cam_from_rig`` are
+                replaced by the nearest rotations. ``init`` is ignored if it is not finite, or if the determinant of its
+                matrix is not positive.
             img_sigma: standard deviation of the noise on each pixel coordinate, at least 0: a number, or a tensor of
                 shape :math:`(B,)` or :math:`(B, N)` with NaN where unknown. With ``img_sigma`` or ``world_sigma``,
                 residuals and the scales of the refinement's kernel are in standard deviations.
@@ -218,7 +219,7 @@ class PnPNet(PretrainedMixin):
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior adds a
                 term to the cost, and thus affects the refinement and the choice of the best pose. Unless ``init`` is
                 given, the refinement also starts from the prior's pose. ``ok`` and ``probability`` depend on the pairs
-                alone. If the noise is unknown, the refinement with a prior assumes a standard deviation of one pixel.
+                alone. If neither call nor initialiser gives the noise, the noise of pixels is assumed to be one pixel.
             dist: 4, 5, 8, 12 or 14 distortion coefficients, as in Kornia and OpenCV, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
@@ -234,8 +235,9 @@ class PnPNet(PretrainedMixin):
 
         Returns:
             The :class:`~kornia_pnpnet.result.PnPResult`. Gradients flow through pose, intrinsics, dist, weights and
-            cost of problems that are ``ok``, and through the first guess of every valid problem. A problem without a
-            finite pose gets the identity as its pose, and the square root of the dtype's largest number as its cost.
+            cost of problems that are ``ok``, and through the first guess of every valid problem (see ``init`` there). A
+            problem without a finite pose gets the identity as its pose, and the square root of the dtype's largest
+            number as its cost.
 
         Raises:
             ShapeError: for shapes that do not fit each other, fewer than 3 pairs, or a number of pairs that the

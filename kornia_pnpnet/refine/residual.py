@@ -5,7 +5,7 @@ focal length and the principal point 0. A point is *in front* when its depth exc
 distance. This test does not depend on the unit of the world.
 
 The dimensions of tensors are coordinates, pairs and problems, in this order, so that operations run over long rows of
-memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection (``tests/test_kornia_fit.py``),
+memory. Kornia's ``transform_points`` and ``project_points`` compute the same projection (``tests/test_kornia.py``),
 but take three times as long for 1000 problems of 9 pairs.
 """
 
