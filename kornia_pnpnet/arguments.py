@@ -22,7 +22,7 @@ from kornia_pnpnet.core.checks import (
 )
 from kornia_pnpnet.core.performance import full_precision, present_first, sees_values
 from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Noise
 from kornia_pnpnet.result import PnPResult, Pose, PosePrior, camera_matrices, with_rotation
 
@@ -182,7 +182,7 @@ def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | N
     grouped by number of pairs, to limit padding. This saves a third to half of the time if the numbers differ strongly.
     """
     batch, count = inputs.world_points.shape[:2]
-    if inputs.world_points.device.type != "cpu" or not sees_values(inputs.world_points) or not batch:
+    if inputs.world_points.device.type != "cpu" or not sees_values(*iter_tensors(inputs)) or not batch:
         return solve(inputs)
     most = batch * count if most is None or torch.is_grad_enabled() else most * torch.get_num_threads()
     if not any_number or inputs.mask is None:

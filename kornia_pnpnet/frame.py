@@ -12,7 +12,7 @@ from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import span_a_plane
 from kornia_pnpnet.core.performance import ascending_order, exporting, ranked
 from kornia_pnpnet.core.symmetric import are_semi_definite
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import map_tensors, pairs_at
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose, Status, sound_pose
@@ -290,11 +290,7 @@ class Normalize(Configured):
         if rig is not None:
             rig = Pose(rig.rotation, rig.translation / size[:, None, None])
         if order is not None:
-            position = order
-            noise, confidence, rig = map_tensors(
-                lambda x: x.gather(1, position.view(*position.shape, *(1,) * (x.ndim - 2)).expand_as(x)),
-                (noise, confidence, rig),
-            )
+            noise, confidence, rig = pairs_at((noise, confidence, rig), order)
         scales = mean_scale, size.reciprocal(), is_usual.mT
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
 

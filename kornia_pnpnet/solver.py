@@ -361,7 +361,7 @@ class PnPNet(PretrainedMixin):
     def _attempt(self, inputs: Inputs, call: _Call, *, nominal: bool = False) -> _Attempt:
         """Propose poses, refine them, and judge the best pose. ``nominal``: whether the focal length is nominal."""
         fixed = call.first_stage_only or self.effort == "fixed"
-        free = not fixed and sees_values(inputs.world_points)
+        free = not fixed and sees_values(*iter_tensors(inputs))
         can_adapt = trait(self.init, "estimates_noise") and self.refine.m > 0
         adapts = free and (self.effort == "adaptive" or (can_adapt and not self.training))
         compares = free and not self.training and not self._whole.compiled
@@ -392,7 +392,7 @@ class PnPNet(PretrainedMixin):
         result = self._run(self._result, problem.focal, frame, starts, refined, call)
         return _Attempt(problem, frame, starts, refined, result)
 
-    def _propose(self, inputs: Inputs, call: _Call, search_follows: bool) -> tuple[Problem, Frame, Starts]:
+    def _propose(self, inputs: Inputs, call: _Call, searches: bool) -> tuple[Problem, Frame, Starts]:
         problem, frame = self.normalize(*inputs[:5], inputs.noise, inputs.confidence, inputs.rig)
         init = inputs.init
         if call.always:
@@ -415,15 +415,8 @@ class PnPNet(PretrainedMixin):
                 ignored = torch.zeros_like(frame.status) if frame.ignored is None else frame.ignored
                 frame = frame._replace(ignored=torch.where(usable, ignored, Status.INIT.value))
         views = 1 if call.first_stage_only or self.refine.m == 0 else self.views
-        starts = propose(
-            self.init,
-            problem,
-            given,
-            views=views,
-            order=self.normalize.order,
-            fixed=self.effort == "fixed",
-            search_follows=search_follows,
-        )
+        fixed, order = self.effort == "fixed", self.normalize.order
+        starts = propose(self.init, problem, given, views=views, order=order, fixed=fixed, search_follows=searches)
         return problem, frame, starts
 
     def _result(self, focal: Tensor, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:

@@ -50,6 +50,8 @@ def test_effort_is_adaptive_in_inference_and_fixed_in_training_and_in_graphs():
     inputs = SyntheticProblems(n=20, batch_size=3, seed=1).batch(0)[:3]
     mapped = torch.func.vmap(lambda *x: solvers[1](*x).translation)(*inputs)
     assert torch.allclose(mapped, solvers[0](*inputs).translation, rtol=1e-4, atol=1e-4)
+    for_one = torch.func.vmap(lambda x: solvers[1](inputs[0][:1], x[None], inputs[2][:1]).translation[0])(inputs[1][:1])
+    assert torch.allclose(for_one, mapped[:1], rtol=1e-4, atol=1e-4)
     mapped = torch.func.vmap(lambda *x: solvers[0](*x).covariance(*x, img_sigma=1.0))(*inputs)
     expected = solvers[0](*inputs).covariance(*inputs, img_sigma=np.float32(1.0))
     torch.testing.assert_close(mapped, expected, rtol=1e-2, atol=0.0)

@@ -30,16 +30,19 @@ compiling = torch.compiler.is_compiling
 exporting = torch.compiler.is_exporting
 
 
-def sees_values(x: Tensor) -> bool:
-    """Whether Python can read the values. Tracing, ``torch.func.vmap`` and the device ``meta`` prevent reading."""
+def sees_values(*tensors: Tensor) -> bool:
+    """Whether Python can read all values. Tracing, ``torch.func.vmap`` and the device ``meta`` prevent reading."""
     if compiling():
         return False
     functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(x):
-        if functorch.is_batchedtensor(x):
+    for x in tensors:
+        while functorch.is_functorch_wrapped_tensor(x):
+            if functorch.is_batchedtensor(x):
+                return False
+            x = functorch.get_unwrapped(x)
+        if x.device.type == "meta":
             return False
-        x = functorch.get_unwrapped(x)
-    return x.device.type != "meta"
+    return True
 
 
 def in_full_precision(device: str) -> AbstractContextManager[Any]:

@@ -28,6 +28,16 @@ def take(tree: _T, at: Tensor | slice) -> _T:
     return map_tensors(lambda x: x[at] if x.ndim else x, tree)
 
 
+def pairs_at(tree: _T, at: Tensor) -> _T:
+    """Select pairs by positions (B, K) from each tensor (B, N, ...) with N >= K. Other tensors do not change."""
+
+    def pick(x: Tensor) -> Tensor:
+        of_pairs = x.ndim > 1 and x.shape[1] >= at.shape[1]
+        return x.take_along_dim(at.view(*at.shape, *(1,) * (x.ndim - 2)), 1) if of_pairs else x
+
+    return map_tensors(pick, tree)
+
+
 def put(tree: _T, at: Tensor, rows: _T) -> _T:
     """Return a copy of a tree in which the problems at the indices ``at`` are replaced by ``rows``."""
     return map_tensors(lambda x, new: x.index_copy(0, at, new), tree, rows)

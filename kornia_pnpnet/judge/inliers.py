@@ -45,11 +45,6 @@ class Judged(NamedTuple):
     weights: Tensor
     errors: Tensor
 
-    @property
-    def inliers(self) -> Tensor:
-        """Number of inliers, shape (B,)."""
-        return (self.weights > 0).sum(-1)
-
 
 def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> Judged:
     """Find the inliers of a pose. Pairs of weight 0 are not inliers.

@@ -146,7 +146,7 @@ class RANSAC(Initialiser):
                 actual_shape=tuple(problem.world_points.shape),
                 expected_shape=["B", f"{size} or more", "3"],
             )
-        if not compiling() and not all(map(sees_values, problem[:3])):
+        if not compiling() and not sees_values(*problem[:3]):
             raise NotImplementedError(
                 "RANSAC runs neither in torch.func.vmap nor on the device meta, because the number of samples depends "
                 "on tensor values. Instead of vmap, give the solver a larger batch with any leading dimensions."
@@ -264,5 +264,5 @@ def search_on(
         state, rivals = search.state, (rows, as_pose(search.rivals.to(problem.weights)))
         errors = judge(project(state, problems_last(some)), some, limits).errors
         pose, weights = put((pose, weights), rows, (state.pose, 1.0 / (1.0 + errors)))
-    others = starts.others if keep_others else None
+    others = constant.others if keep_others else None
     return starts._replace(pose=pose, others=others, weights=weights), rivals

@@ -108,15 +108,16 @@ class Scene(NamedTuple):
         rows = self.rows.gather(2, positions[:, None, :, None].expand(-1, 3, -1, 13))
         return self._replace(rows=rows, weights=self.weights.gather(2, positions[:, None]))
 
-    def losses(self, poses: Tensor, scorer: Scorer, wider: float = 1.0) -> Tensor:
+    def losses(self, poses: Tensor, scorer: Scorer, *wider: float) -> list[Tensor]:
         """Losses (P, H) of poses (P, 12, H): the weighted sum of the pairs' losses, plus the losses of the priors.
 
-        Squared residuals are divided by ``wider``.
+        For each number in ``wider``, further losses (P, H) follow, with squared residuals divided by this number.
         """
         errors = self.errors(poses)
-        losses = (self.weights @ scorer(errors if wider == 1.0 else errors.div_(wider)))[:, 0]
+        losses = [(self.weights @ scorer(errors if by == 1.0 else errors / by))[:, 0] for by in (1.0, *wider)]
         for term in map_tensors(lambda x: x[:, None], self.terms):  # broadcasts over H poses
-            losses = losses + term.disagreement(as_pose(poses.mT))
+            penalty = term.disagreement(as_pose(poses.mT))
+            losses = [x + penalty for x in losses]
         return losses
 
     def errors(self, poses: Tensor) -> Tensor:

@@ -3,14 +3,14 @@ r"""The search of RANSAC: solve minimal samples, score their poses, and improve 
 from __future__ import annotations
 
 import math
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import solve_positive
 from kornia_pnpnet.core.performance import compiling, present_first
-from kornia_pnpnet.core.trees import map_tensors, take
+from kornia_pnpnet.core.trees import map_tensors, pairs_at, take
 from kornia_pnpnet.judge.evidence import pose_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge, median_residual, residual_noise
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
@@ -27,8 +27,6 @@ __all__ = ["CAUCHY", "Search", "are_open", "cauchy_scale", "least_squares"]
 #: Scale of the Cauchy kernel in standard deviations.
 CAUCHY = 3.4
 
-_T = TypeVar("_T")
-
 # Poses are compared and improved in this dtype. At a focal length of 3400 px, rounding errors are about 1e-4 px.
 _DTYPE = torch.float32
 # Largest number of samples that a CPU solves and scores at once, so that the tensors fit into a core's caches.
@@ -42,9 +40,10 @@ _ROUNDS_LEFT, _FEW_SAMPLES = 2, 120
 # samples did not suffice for a confidence of 0.999, the share w of inliers is below (7 / k)^(1/3). Among 3 / w pairs,
 # at least one is an inlier with a probability of 95 %.
 _FIRST_PAIRS, _PAIRS_BY_SAMPLES = 24, 3.0 / 7.0 ** (1 / 3)
-# After each scoring of a round, the best half of the poses is scored again by four times as many pairs. If fewer poses
-# were kept, the best pose could be lost: with 90 % outliers, the first pairs contain few inliers.
-_KEPT_ONE_IN, _MORE = 2, 4
+# A minimal solver fills about a quarter of its slots. After each scoring of a round, the best half of the poses is
+# scored again by four times as many pairs. If fewer poses were kept, the best pose could be lost: with 90 % outliers,
+# the first pairs contain few inliers.
+_FILLED_ONE_IN, _KEPT_ONE_IN, _MORE = 4, 2, 4
 # If (slots for poses) x (pairs) is at most this number, scoring the empty slots is faster than removing them.
 _FEW_RESIDUALS = 4096
 # Each round improves the _IMPROVED poses of smallest loss. The best improved pose is then improved again.
@@ -117,7 +116,7 @@ class Search:
         if ranks:
             order = ranked(problem, chances > 0)
             of_pairs = problem.world_points, problem.img_points, problem.weights, problem.rig
-            of_pairs, chances, thresholds, sigma = _in_order((of_pairs, chances, thresholds, sigma), order)
+            of_pairs, chances, thresholds, sigma = pairs_at((of_pairs, chances, thresholds, sigma), order)
             world_points, img_points, weights, rig = of_pairs
             problem = problem._replace(world_points=world_points, img_points=img_points, weights=weights, rig=rig)
         self.finds_rivals = finds_rivals
@@ -185,8 +184,8 @@ class Search:
         poses, valid = self._solved(problems, positions)
         jury = self.scene.pairs(judges.clamp(min=0))
         jury = jury._replace(weights=torch.where(judges[:, None] >= 0, jury.weights, 0.0))
-        _, poses, _ = self._best_of(jury, poses, valid, _IMPROVED)
-        losses = self.scene.losses(poses, self.plan.score)
+        _, poses, _ = self._best_of(jury.losses(poses, self.plan.score)[0], poses, valid, _IMPROVED)
+        losses = self.scene.losses(poses, self.plan.score)[0]
         self.loss, self.poses = self._improved(problems, losses, poses)
 
     def _state(self, poses: Tensor) -> State:
@@ -269,15 +268,21 @@ class Search:
         poses, valid = self._solved(problems, self.samples.positions(problems, start, stop))
         # Repeated samples of a problem are invalid, so that its best poses do not depend on the rest of the batch.
         fresh = torch.arange(start, stop, device=problems.device) < self.samples.totals[problems, None]
-        valid = valid & fresh.repeat(1, valid.shape[1] // (stop - start))
+        slots_of_sample = valid.shape[1] // (stop - start)
+        valid = valid & fresh.repeat(1, slots_of_sample)
         if valid.shape[1] * self.low.shape[1] > _FEW_RESIDUALS:
             slots = present_first(valid)[:, : max(1, int(valid.sum(1).max()))]
             poses, valid = poses.gather(2, slots[:, None].expand(-1, 12, -1)), valid.gather(1, slots)
-        scene, width = take(self.scene, problems), poses.shape[-1]
-        pairs = max(_FIRST_PAIRS, math.ceil(_PAIRS_BY_SAMPLES * start ** (1 / 3)))
-        while 2 * pairs <= self.low.shape[1]:
-            width = max(width // _KEPT_ONE_IN, _IMPROVED)
-            _, poses, valid = self._best_of(scene.pairs(self.samples.spread(problems, pairs)), poses, valid, width)
+        scene, present = take(self.scene, problems), self.samples.counts[problems]
+        pairs, most = max(_FIRST_PAIRS, math.ceil(_PAIRS_BY_SAMPLES * start ** (1 / 3))), int(present.max())
+        best = fresh.sum(1) * max(slots_of_sample // _FILLED_ONE_IN, 1)
+        kept = torch.full_like(best, valid.shape[1])
+        while 2 * pairs <= most:  # each problem keeps as many poses as it would keep alone
+            best = best // _KEPT_ONE_IN
+            kept = torch.where(2 * pairs <= present, best.clamp(min=_IMPROVED), kept)
+            losses = scene.pairs(self.samples.spread(problems, pairs)).losses(poses, self.plan.score)[0]
+            _, poses, valid = self._best_of(losses, poses, valid, int(kept.max()))
+            valid = valid & (torch.arange(valid.shape[1], device=valid.device) < kept[:, None])
             pairs *= _MORE
         return self._compared(problems, scene, poses, valid)
 
@@ -296,20 +301,22 @@ class Search:
 
     def _compared(self, problems: Tensor, scene: Scene, poses: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Find the best of poses (P, 12, W): ascending losses (P, K), entries (P, 12, K). Also store better rivals."""
-        if self.finds_rivals:
-            loss, rival, _ = self._best_of(scene, poses, valid, 1, _WIDER)
+        losses, *wider = scene.losses(poses, self.plan.score, *[_WIDER] * self.finds_rivals)
+        for each in wider:
+            loss, rival, _ = self._best_of(each, poses, valid, 1)
             better = loss[:, 0] < self.rival_loss[problems]
             at = problems[better]
             self.rival_loss[at], self.rivals[at] = loss[better, 0], rival[better, :, 0]
-        return self._best_of(scene, poses, valid, _IMPROVED)[:2]
+        return self._best_of(losses, poses, valid, _IMPROVED)[:2]
 
-    def _best_of(
-        self, judges: Scene, poses: Tensor, valid: Tensor, width: int, wider: float = 1.0
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Ascending losses (P, K), entries (P, 12, K) and validity (P, K) of the K poses with the smallest losses."""
-        losses = judges.losses(poses, self.plan.score, wider).masked_fill(~valid, torch.inf)
-        losses, order = losses.topk(min(width, losses.shape[1]), largest=False)
-        return losses, poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
+    def _best_of(self, losses: Tensor, poses: Tensor, valid: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Losses (P, K), entries (P, 12, K) and validity (P, K) of the K poses with the smallest losses, best first."""
+        losses = losses.masked_fill(~valid, torch.inf)
+        # Of equal losses, which are frequent, the first wins. `topk` alone would choose by the width of the batch.
+        places = torch.arange(1, losses.shape[1] + 1, dtype=losses.dtype, device=losses.device)
+        keys = losses.addcmul(losses, places, value=2.0 * torch.finfo(losses.dtype).eps)
+        order = keys.topk(min(width, losses.shape[1]), largest=False).indices
+        return losses.gather(1, order), poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
 
     def _improved(self, problems: Tensor, losses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
         """Improve poses (P, 12, K) by a least-squares step on their inliers, and the best new pose by a second step.
@@ -327,7 +334,7 @@ class Search:
             if camera.shape[1]:
                 entries = torch.cat((entries[:, :8], entries[:, 8:] * (-camera).exp()), 1)
             new = entries.view_as(poses.mT).mT
-            new_losses = scene.losses(new, self.plan.score)
+            new_losses = scene.losses(new, self.plan.score)[0]
             better = (new_losses < losses) & losses.isfinite()
             losses, poses = torch.where(better, new_losses, losses), torch.where(better[:, None], new, poses)
             losses, best = losses.min(1, keepdim=True)
@@ -338,15 +345,6 @@ class Search:
         """Improve poses (P, 12, K), and store the best pose of each problem."""
         if len(problems):
             self.loss[problems], self.poses[problems] = self._improved(problems, losses, poses)
-
-
-def _in_order(tree: _T, order: Tensor) -> _T:
-    """Take the pairs at positions (B, N) from tensors (B, N, ...). Tensors (B, 1) do not change."""
-
-    def take(x: Tensor) -> Tensor:
-        return x if x.shape[1] == 1 else x.take_along_dim(order.view(*order.shape, *(1,) * (x.ndim - 2)), 1)
-
-    return map_tensors(take, tree)
 
 
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:
@@ -369,7 +367,7 @@ def are_open(projection: Projection, problem: Problem, inliers: Tensor, sigma: T
     """Whether the inliers (B, N) determine the pose poorly, bool (B,). ``sigma`` is the noise of the pixels.
 
     An incorrect pose may then have as many inliers as the correct pose, for example if the camera sees a flat scene in
-    a narrow field of view. More samples find more such poses. With fewer than `_OPEN_PAIRS`, no pose is open.
+    a narrow field of view. More samples find more such poses. With fewer than `_OPEN_PAIRS` pairs, no pose is open.
     """
     enough = (problem.weights > 0).sum(-1) >= _OPEN_PAIRS
     if inliers.shape[1] < _OPEN_PAIRS:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import TypeVar
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -14,7 +13,7 @@ from torch.nn import functional
 from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.linalg import align, solve_symmetric
 from kornia_pnpnet.core.performance import are_few, compiling, present_first, problems_last, sees_values, take_pairs
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.trees import pairs_at
 from kornia_pnpnet.judge.evidence import groups, totals
 from kornia_pnpnet.problem import Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
@@ -25,8 +24,6 @@ from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO, project
 from kornia_pnpnet.result import Pose
 
 __all__ = ["SetInit"]
-
-_T = TypeVar("_T")
 
 # Number of features of a pair, see `_View`. Confidences and repeats add further features.
 _FEATURES = 14
@@ -161,16 +158,6 @@ def _frame(affine: Tensor, squares: Tensor) -> Tensor:
     return torch.stack((u, v, torch.linalg.cross(u, v)), 1)
 
 
-def _taken(tree: _T, index: Tensor) -> _T:
-    """Select pairs by positions (B, K) in each tensor (B, N, ...) of pairs. Other tensors do not change."""
-
-    def take(x: Tensor) -> Tensor:
-        of_pairs = x.ndim > 1 and x.shape[1] > index.shape[1]
-        return x.take_along_dim(index if x.ndim == 2 else index[..., None], 1) if of_pairs else x
-
-    return map_tensors(take, tree)
-
-
 @torch.no_grad()
 def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
     """Agreement (B, N) of each pair with a pose, in [0, 1]. Points behind the camera have the agreement 0."""
@@ -188,7 +175,7 @@ def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
 
 def _samples(count: int, number: int, search_follows: bool) -> tuple[Sequence[int], list[int]]:
     """How many pairs a problem must have for each of S samples, and the 3 S ranks of the pairs of these samples."""
-    every = [(0, sample) for sample in _SAMPLES[:number] if max(sample) < count]
+    every = [(0, sample) for sample in _SAMPLES[: max(number, 1)] if max(sample) < count]
     if not search_follows:  # a search draws further samples
         every += [(least, (f * i, f * j, f * k)) for least, f in _SPREADS for _, (i, j, k) in every]
         every += [(_RING_FROM, sample) for sample in _RING]
@@ -285,8 +272,8 @@ class SetInit(Initialiser):
         heads: number of attention heads of each layer.
         hidden: number of channels inside a layer.
         starts: number of hypotheses of the network, at least 1.
-        samples: number of minimal samples of the six likeliest pairs, 0 to 8. Problems of at least 18 pairs have
-            further samples.
+        samples: number of minimal samples of the six likeliest pairs, 0 to 8, at least 1 before a search. Problems of
+            at least 18 pairs have further samples.
         confidence: whether the network sees the ``confidence`` of the correspondences.
         repeats: whether the network sees how many pairs share a pixel and how many pairs share a world point.
 
@@ -349,7 +336,7 @@ class SetInit(Initialiser):
         Returns:
             The poses of all hypotheses, the weights, and the noise of each pair. If ``samples`` is not 0, the
             last hypothesis is the best pose of the samples. If a search follows, the poses of the network compete
-            with the poses of the samples, and the last hypothesis is the winner.
+            with the poses of the samples, and the last hypothesis is the winner, also if ``samples`` is 0.
 
         Raises:
             DeviceError: when the problem and the network are on different devices.
@@ -361,7 +348,7 @@ class SetInit(Initialiser):
             usual = problem.usual_weights > 0
             order = ranked(problem, usual)
             index = order.gather(1, spread_evenly(usual.gather(1, order), _ENOUGH))
-            problem, same = _taken((problem, same), index)
+            problem, same = pairs_at((problem, same), index)
         view = _View(problem, self.confidence, same)
         of_pairs, of_problem = (x.to(view.there.dtype) for x in self._run(view))
         probability = torch.sigmoid(of_pairs[0])
@@ -379,8 +366,8 @@ class SetInit(Initialiser):
         rotation, translation, _ = align(source, points, counts.flatten(0, 1))
         poses = [*map(Pose, *(x.unflatten(0, (starts, -1)).unbind() for x in (rotation, translation)))]
         noises = self._noise(given, view, noise)
-        if self.samples:
-            visible = noises if index is None else _taken(noises, index)
+        if self.samples or search_follows:
+            visible = noises if index is None else pairs_at(noises, index)
             poses.append(self._sampled(problem, chances, visible, poses, search_follows))
         if index is not None:
             probability = _agreement(given, noises, poses[-1]).scatter(1, index, probability)
@@ -390,7 +377,7 @@ class SetInit(Initialiser):
     def _sampled(
         self, problem: Problem, chances: Tensor, noise: Noise, others: Sequence[Pose], search_follows: bool
     ) -> Pose:
-        """Find the best-scoring pose of all samples, or return ``others[0]`` if no sample has a valid pose.
+        """Find the best-scoring pose of all samples, or return ``others[0]`` if no pair supports a pose.
 
         If a search follows, the ``others`` compete with the poses of the samples.
         """
