@@ -40,8 +40,6 @@ def main(config: DictConfig) -> float | None:
     runtime = HydraConfig.get()
     sweeps = runtime.mode == RunMode.MULTIRUN
     folder = Path(runtime.runtime.output_dir)
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
     try:
         fabric = instantiate(config.engine)
     except InstantiationException as error:
@@ -51,6 +49,8 @@ def main(config: DictConfig) -> float | None:
             "Install PyTorch for your GPU, or pass engine=cpu."
         )
     fabric.launch()
+    if config.threads is not None:  # after the launch, which sets the threads of several processes
+        torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     model = instantiate(config.model.solver)
     origin = start = None

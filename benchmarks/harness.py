@@ -9,7 +9,7 @@ import sys
 import time
 import timeit
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,9 @@ def threads(count: int = 1) -> Iterator[None]:
     """
     keep_freed_memory()
     libraries: list[tuple[Callable[[], int], Callable[[int], None]]] = [(torch.get_num_threads, torch.set_num_threads)]
-    if cv2 := sys.modules.get("cv2"):  # its solvers have imported it
+    with suppress(ImportError):
+        import cv2
+
         libraries.append((cv2.getNumThreads, cv2.setNumThreads))
     with ExitStack() as stack:
         for get, change in libraries:

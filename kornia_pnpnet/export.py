@@ -151,7 +151,8 @@ def export_program(
     shapes = (points, points, points if rig else sizes, points, *((points, points),) * rig)
     try:
         with torch.no_grad(), warnings.catch_warnings(action="ignore", category=FutureWarning):  # PyTorch's code warns
-            return torch.export.export(_Graph(copy.deepcopy(solver).float().eval()), inputs, dynamic_shapes=shapes)
+            graph = _Graph(copy.deepcopy(solver).cpu().float().eval())
+            return torch.export.export(graph, inputs, dynamic_shapes=shapes)
     except Exception as error:
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {_reason(error)}") from error
 
@@ -292,7 +293,7 @@ class PackagedSolver:
         check_shapes(dict(zip(RIG_INPUTS, zip(inputs, shapes, strict=False), strict=False)))
         inputs = [x.to("cpu", torch.float32) for x in inputs]
         if n < size:  # the padding repeats the last pair, with weight 0
-            pair = torch.arange(size).clamp(max=n - 1)
+            pair = torch.arange(size, device="cpu").clamp(max=n - 1)
             inputs = [x if i == 2 and not self.rig else x.index_select(1, pair) for i, x in enumerate(inputs)]
             inputs[3][:, n:] = 0.0
         # Compiled code does not check strides. Results are copied, because the next call may overwrite them.

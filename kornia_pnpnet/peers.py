@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import sys
 from dataclasses import dataclass, field, fields
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -74,6 +75,8 @@ class PeerSolver(nn.Module):
     def library(self) -> ModuleType:
         """Import the library, or raise an ``ImportError`` that names the extra to install."""
         module, name = self.source
+        if loaded := sys.modules.get(module):  # saves time in each call
+            return loaded
         with needs("eval", f"This solver needs {name}"):
             return importlib.import_module(module)
 
@@ -276,7 +279,9 @@ class OpenCVRansac(_OpenCV, RobustPeer):
         first = cv2.Rodrigues(turn)[0], shift.ravel().copy()
         if self.refine and len(kept) > 3:
             turn, shift = cv2.solvePnPRefineLM(world[kept], img[kept], intrinsics, None, turn, shift)
-        return PeerPose(cv2.Rodrigues(turn)[0], shift.ravel(), np.isin(np.arange(len(world)), kept), first)
+        inliers = np.zeros(len(world), dtype=bool)
+        inliers[kept] = True
+        return PeerPose(cv2.Rodrigues(turn)[0], shift.ravel(), inliers, first)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -319,7 +324,8 @@ class KorniaRs(RobustPeer):
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         """See :meth:`PeerSolver.solve_one`."""
         k3d = self.library()
-        options = {**self.config(), "method": getattr(k3d.PnPSolverMethod, self.method)}
+        options = {"threshold": self.threshold, "confidence": self.confidence, "max_iterations": self.max_iterations}
+        options |= {"seed": self.seed, "method": getattr(k3d.PnPSolverMethod, self.method)}
         try:
             rotation, translation, inliers, _ = k3d.solve_pnp_ransac(world_points, img_points, intrinsics, **options)
         except ValueError:  # no pose found, or too few pairs for the method
@@ -352,8 +358,9 @@ class PoseLib(RobustPeer):
         KORNIA_CHECK(not unknown, f"PoseLib {poselib.__version__} has no options {sorted(unknown)}.")
 
     def _options(self) -> dict[str, Any]:
-        names = {"threshold": "max_reproj_error", "confidence": "success_prob"}
-        return {names.get(name, name): value for name, value in self.config().items()}
+        options = {"max_reproj_error": self.threshold, "success_prob": self.confidence, "seed": self.seed}
+        options |= {"min_iterations": self.min_iterations, "max_iterations": self.max_iterations}
+        return {**options, "progressive_sampling": self.progressive_sampling}
 
     def solve_one(self, world_points: np.ndarray, img_points: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         """See :meth:`PeerSolver.solve_one`."""

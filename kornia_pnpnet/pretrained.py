@@ -95,11 +95,13 @@ def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
 def find_weights(name_or_folder: str | Path) -> Path:
     """Find shipped weights of the given name, else a local folder, else a repository of the Hugging Face Hub.
 
+    A :class:`~pathlib.Path` is always a local folder.
+
     Raises:
         FileNotFoundError: when no shipped weights, folder or repository has this name.
     """
     name = str(name_or_folder)
-    for folder in (WEIGHTS_FOLDER / name, Path(name)):
+    for folder in (Path(name),) if isinstance(name_or_folder, Path) else (WEIGHTS_FOLDER / name, Path(name)):
         if (folder / CONFIG_NAME).is_file():
             return folder
     files = f"a folder needs {CONFIG_NAME} and {WEIGHTS_NAME}"

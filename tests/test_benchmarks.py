@@ -165,7 +165,7 @@ def test_throughput_and_latency_have_a_row_for_every_point(tmp_path, monkeypatch
         spread = row["quantiles_us"]
         assert spread == sorted(spread)
         assert spread[0] <= row["median_us"] <= row["p90_us"] <= row["p99_us"] <= row["max_us"]
-        assert row["success"]["total"] == row["calls"]
+        assert row["success"]["total"] == max(1, performance.QUICK.latency_calls // (1, 4)[row["threads"] - 1])
 
 
 def test_compiled_solvers_are_measured_with_nine_pairs_only(monkeypatch):

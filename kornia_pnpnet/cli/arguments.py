@@ -64,8 +64,8 @@ def _counts(text: str) -> list[int]:
 
 def _focal(text: str) -> dict[str, Any]:
     """Parse ``--focal`` into options of :class:`~kornia_pnpnet.PnPNet`."""
-    if text in ("known", "unknown"):
-        return {"focal": text}
+    if text in ("known", "unknown"):  # without the prior that a saved solver may have
+        return {"focal": text, "focal_sigma": None, **({"radial": 0} if text == "known" else {})}
     if (sigma := _positive(text)) > _MOST_SIGMA:
         fix = f"pass --intrinsics {text},{text},cx,cy; SIGMA is a fraction, such as 0.1"
         raise argparse.ArgumentTypeError(f"{text} is a focal length: {fix}")

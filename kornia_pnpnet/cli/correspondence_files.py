@@ -120,8 +120,8 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read the named arrays of an NPZ file. Raise ``InputError`` if ``world_points`` or ``img_points`` is missing."""
     try:
         arrays = read_npz(path, {*names, *_REFUSED_ARRAYS})
-    except ValueError as error:
-        raise InputError(path, str(error)) from None
+    except (OSError, ValueError) as error:
+        raise InputError(path, getattr(error, "strerror", None) or str(error)) from None
     if refused := arrays.keys() & _REFUSED_ARRAYS:
         raise InputError(path, f"the array {min(refused)} is not read: use weights, with 0 for pairs to ignore")
     for name in ("world_points", "img_points"):

@@ -40,7 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         results = comparison.evaluate(solvers, sets, path=out, overwrite=arguments.overwrite)
     except KeyboardInterrupt:
-        print(f"pnpnet: interrupted; the same command continues {out}", file=sys.stderr)
+        same = "the same command" + " without --overwrite" * arguments.overwrite
+        print(f"pnpnet: interrupted; {same} continues {out}", file=sys.stderr)
         return 130
     if not results["rows"]:
         raise ValueError(f"no solver accepts these problems: {results['left_out'][0]['reason']}")

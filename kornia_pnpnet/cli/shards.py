@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, nullcontext, suppress
-from importlib.util import find_spec
+from contextlib import ExitStack, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,7 +65,7 @@ def solve_shards(
         name: name of the solver. Results files store this name and a digest of weights, options and intrinsics.
         batch: largest number of problems that are solved at once. Parquet shards are also read in such parts.
         overwrite: also solve the shards that have results.
-        progress: show a progress bar if stderr is a terminal and tqdm is installed.
+        progress: show a progress bar if stderr is a terminal.
 
     Raises:
         InputError: when there is no shard, when two shards would have results of the same name, when ``out`` is the
@@ -126,15 +125,14 @@ def _solver_of(target: Path) -> bytes | None:
 
 
 def _bar(shards: Iterable[Path], shown: bool) -> Any:
-    """Make a progress bar that counts problems. If ``shown`` is false or tqdm is missing, make an empty context."""
-    if not shown or find_spec("tqdm") is None:
-        return nullcontext()
+    """Make a progress bar that counts problems. If ``shown`` is false, the bar prints nothing."""
     from tqdm import tqdm
 
     total = None  # the total is unknown with NPZ files and with files that cannot be read
     with suppress(OSError, pa.ArrowException):
-        total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
-    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)  # no bar without a terminal
+        total = sum(parquet.read_metadata(shard).num_rows for shard in shards if shown)
+    disable = None if shown else True  # None: no bar without a terminal
+    return tqdm(total=total, unit="problem", unit_scale=True, disable=disable)
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:
@@ -152,8 +150,7 @@ def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: in
                 writer = stack.enter_context(parquet.ParquetWriter(file, schema))
             writer.write_table(result)
             solved, count = solved + compute.sum(result["ok"], min_count=0).as_py(), count + len(result)
-            if bar is not None:
-                bar.update(len(result))
+            bar.update(len(result))
     return solved, count
 
 

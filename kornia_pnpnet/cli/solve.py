@@ -69,7 +69,7 @@ def _load_solver(arguments: argparse.Namespace) -> nn.Module:
     from kornia_pnpnet.solver import PnPNet
 
     solver = load_solver_without_truth(arguments.solver)
-    if not arguments.focal:
+    if not arguments.focal or arguments.focal["focal"] == getattr(solver, "focal", "known") == "known":
         return solver
     if not isinstance(solver, PnPNet):
         raise ValueError(f"--focal: {arguments.solver} does not estimate focal lengths")

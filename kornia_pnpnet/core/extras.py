@@ -25,4 +25,5 @@ def needs(extra: str, message: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise ImportError(f"{message}: {how_to_install(extra)}") from error
+        why = "" if isinstance(error, ModuleNotFoundError) else f" ({error})"
+        raise ImportError(f"{message}{why}: {how_to_install(extra)}") from error

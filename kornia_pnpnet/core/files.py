@@ -33,8 +33,9 @@ class InputError(ValueError):
 def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
     """Open a temporary file for writing, and rename the complete file to ``path``. Missing folders are made."""
     path = Path(path)
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():  # a folder, or a device such as /dev/null
+        number = errno.EISDIR if path.is_dir() else errno.EINVAL
+        raise OSError(number, os.strerror(number), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # readers of a folder of tables skip hidden files
     try:

@@ -28,7 +28,7 @@ class GradientWatch:
         if len(self._solved) == _CALLS or not (learns and readable and ok.numel()):
             return
         self._solved.append(ok.any())
-        if len(self._solved) == _CALLS and not torch.stack(self._solved).any():
+        if len(self._solved) == _CALLS and not any(map(bool, self._solved)):  # the devices may differ
             warnings.warn(
                 f"No problem of the first {_CALLS} batches is ok, and only problems that are ok have a gradient: "
                 "nothing can be learned from these poses. Start with the loss monte_carlo_pose_loss (how to: Train "

@@ -32,7 +32,7 @@ _COMPETITORS = (
 # Options of RANSAC for real scenes. This threshold is the best of a grid from 3 to 60 px on five scenes with 0, 2 and 4
 # outliers in 9 pairs. Success hardly changes from 6 to 20 px. The seed of these problems was not `DEFAULT_SEED`.
 _SCENE_OPTIONS = dict.fromkeys(
-    ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "poselib", "pycolmap"), "threshold=12"
+    ("ransac-epnp-lm", "p3p-ransac", "opencv-ransac", "opencv-usac", "kornia-rs", "poselib", "pycolmap"), "threshold=12"
 )
 # Options of RANSAC for synthetic data. These thresholds are the best of a grid from (3 px, 0.15 m) to
 # (8 px, 0.4 m) on problems whose seed was not `DEFAULT_SEED`. Success varies by one percentage point over the grid.
