@@ -73,6 +73,8 @@ if [ -n "${MATCHES:-}" ]; then
     done
     for pixels in 2 3 4 6 8; do
         grid="$grid p3p-ransac:threshold=$pixels pycolmap:threshold=$pixels opencv-usac:threshold=$pixels"
+        grid="$grid pycolmap:threshold=$pixels,loss_scale=1,max_iterations=100000"
+        grid="$grid opencv-usac:threshold=$pixels,iterations=100000"
     done
     part seen benchmarks/real_matches.py measure "$MATCHES"/seen/*.npz --out docs/results/real_matches_seen.json \
         --split "Seen: scenes of earlier measurements; the options of other libraries were chosen here" \

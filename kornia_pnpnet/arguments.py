@@ -10,7 +10,7 @@ from kornia.core.exceptions import ShapeError, TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kornia_pnpnet.cameras import check_coefficients, looking_along, with_undistorted
+from kornia_pnpnet.cameras import check_coefficients, looking_along, pinholes, with_undistorted
 from kornia_pnpnet.core.checks import (
     Shapes,
     check_devices,
@@ -119,15 +119,11 @@ def checked_inputs(
 
     per_pair = matrices if matrices.ndim == 2 or of_pair else matrices[..., None, :, :]
     cameras = per_pair.expand(*pairs, 3, 3) if is_rig else matrices.expand(*size, 3, 3)
-    init, rig = (None if pose is None else Pose(*pose) for pose in (init, cam_from_rig))
-    inputs = Inputs(world_points, img_points, cameras, weights, mask, init, noise, confidence, prior, rig)
+    inputs = Inputs(world_points, img_points, cameras, weights, mask, init, noise, confidence, prior, cam_from_rig)
     inputs = map_tensors(one_batch, inputs)
-    init, prior, rig = inputs.init, inputs.prior, inputs.rig
-    inputs = inputs._replace(
-        init=init and with_rotation(init),
-        prior=prior and prior._replace(pose=with_rotation(Pose(*prior.pose))),
-        rig=rig and with_rotation(rig),
-    )
+    init, rig = (pose and with_rotation(Pose(*pose)) for pose in (inputs.init, inputs.rig))
+    prior = inputs.prior and inputs.prior._replace(pose=with_rotation(Pose(*inputs.prior.pose)))
+    inputs = inputs._replace(init=init, prior=prior, rig=rig)
     if is_bearing:
         return size, looking_along(inputs)
     if dist is None and fisheye is None:
@@ -169,8 +165,7 @@ def given_cameras(intrinsics: Tensor | PinholeCamera | None, size: torch.Size, l
     """Return the caller's camera matrices of a rig, for each problem or each pair, scaled to a last entry of 1."""
     if intrinsics is None:
         return torch.eye(3, dtype=like.dtype, device=like.device).expand(*size, 3, 3)
-    matrices = camera_matrices(intrinsics, size).to(like.dtype)
-    matrices = matrices / matrices[..., 2:, 2:]
+    matrices, _ = pinholes(camera_matrices(intrinsics, size).to(like.dtype))
     return matrices.expand(*size, 3, 3) if matrices.ndim == 2 else matrices
 
 

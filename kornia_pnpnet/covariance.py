@@ -10,10 +10,9 @@ from kornia.core.exceptions import ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import So3
 from torch import Tensor
-from torch.nn.functional import pad
 
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
-from kornia_pnpnet.cameras import zoomed
+from kornia_pnpnet.cameras import focal_length, zoomed
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
@@ -171,7 +170,7 @@ def pose_covariance(
         depth = pose.translation[:, 2] + rotated_centroid[:, 2]
         shift = torch.cat((shift, depth[:, None, None] * eye[2:3, :3].mT), -1)
     first, last = (eye[rows].expand(len(matrix), -1, -1) for rows in (slice(3), slice(6, None)))
-    back = torch.cat((first, pad(shift, (0, len(eye) - shift.shape[-1])), last), 1)
+    back = torch.cat((first, shift, last), 1)
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
     covariance = torch.where(determined, covariance, eye.masked_fill(eye > 0, torch.inf))
     return restore_leading(size, covariance.to(dtype))
@@ -200,16 +199,20 @@ def shown_noise(
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
-    # Variance of each pixel if only the points have noise, with the standard deviation 1.
-    of_points = pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
-    mean = (weights * of_points).sum(1) / total
+    cameras = frame.intrinsics[:, None] if frame.intrinsics.ndim == 3 else frame.intrinsics
+    unit = problem.focal / focal_length(cameras)  # number of the problem's pixels per undistorted pixel, (B, 1 or N)
+    unit = (unit if inputs.lens_scale is None else unit * inputs.lens_scale).expand_as(weights)
+    # Variance of each pixel if only the caller's pixels, or only the points, have noise of the standard deviation 1.
+    of_pixels, of_points = unit.square(), pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
+    by_pixel, mean = ((weights * x).sum(1) / total for x in (of_pixels, of_points))
     share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)
-    variance = share[..., None] + (1.0 - share[..., None]) * of_points / mean[:, None]  # (S, B, N)
+    variance = share[..., None] * of_pixels / by_pixel[:, None]  # (S, B, N)
+    variance = variance + (1.0 - share[..., None]) * of_points / mean[:, None]
     variance = torch.where(weights > 0, variance, 1.0)
     scale = (weights * projection.sq_residual / variance).sum(-1) / (2.0 * total - 6.0).clamp(min=1.0)  # (S, B)
     best = (total * scale.log() + (weights * variance.log()).sum(-1)).nan_to_num(torch.inf).argmin(0)
     share, scale = share[best, 0], scale.gather(0, best[None])[0]
-    img, world = (share * scale).sqrt() / problem.img_scale, ((1.0 - share) * scale / mean).sqrt() * frame.size
+    img, world = (share * scale / by_pixel).sqrt(), ((1.0 - share) * scale / mean).sqrt() * frame.size
     return {"img_sigma": restore_leading(size, img.to(dtype)), "world_sigma": restore_leading(size, world.to(dtype))}
 
 

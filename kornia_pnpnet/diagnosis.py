@@ -135,7 +135,7 @@ def _changed(world: Tensor, pixels: Tensor, cameras: Tensor) -> dict[str, tuple[
         return cameras * cameras.new_tensor([[focal, focal, principal], [focal, focal, principal], [1.0, 1.0, 1.0]])
 
     central = camera(1.0, 0.0)
-    central[:, :2, 2] = pixels.amax((0, 1)) / 2.0
+    central[:, :2, 2] = pixels.nan_to_num(0.0, 0.0, 0.0).amax((0, 1)) / 2.0
     return {
         "as given": (world, pixels, cameras),
         "swap u and v": (world, pixels.flip(-1), cameras),

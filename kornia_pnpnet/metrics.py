@@ -125,12 +125,13 @@ def success(errors: PoseErrors, max_rotation_deg: float = 1.0, max_translation: 
         tensor([ True, False, False])
     """
     check_tensors(errors._asdict())
-    for name, value in (("max_rotation_deg", max_rotation_deg), ("max_translation", max_translation)):
+    limits = {"max_rotation_deg": max_rotation_deg, "max_translation": max_translation}
+    for name, value in limits.items():
         if not isinstance(value, (Real, Tensor)):  # also NumPy's numbers
             raise TypeCheckError(f"{name} must be a number, got {type(value).__name__}.")
     rotation, translation = errors
-    limit = max_translation if isinstance(max_translation, Tensor) and max_translation.ndim else None
-    tensors = {"rotation_error_deg": rotation, "max_translation": limit}
+    tensors = {"rotation_error_deg": rotation}
+    tensors |= {name: x for name, x in limits.items() if isinstance(x, Tensor) and x.ndim}
     check_shapes({name: (x, tuple(translation.shape)) for name, x in tensors.items()})
     common_dtype({**tensors, "translation_error": translation})
     check_devices(tensors, translation, "translation_error")

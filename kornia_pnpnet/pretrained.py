@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import json
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from kornia.core.exceptions import BaseError, ValueCheckError
 from torch import Tensor, nn
 
 from kornia_pnpnet.core.files import atomic_open, digest, write_json
+from kornia_pnpnet.core.performance import Runner
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import describe
@@ -127,6 +129,8 @@ class PretrainedMixin(nn.Module):
     init: nn.Module | None
     refine: RobustWeightedLM
     normalize: Normalize
+    _run: Runner
+    _whole: Runner
 
     @classmethod
     def option_names(cls) -> list[str]:
@@ -151,6 +155,7 @@ class PretrainedMixin(nn.Module):
     def with_options(self, *, refine: RobustWeightedLM | None = None, **options: Any) -> Self:
         """Copy the solver with another refinement or other options. The copy and the solver share unchanged modules."""
         copied = type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
+        copied._run, copied._whole = copy.copy(self._run), copy.copy(self._whole)
         return copied.train(self.training)
 
     def config(self) -> dict[str, Any]:

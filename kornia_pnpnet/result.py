@@ -320,7 +320,7 @@ class PnPResult(NamedTuple):
             libraries return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; empty unless the call requested alternatives.
         intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`. In a rig the shape may be
-            :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. Without a rig, the identity
+            :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. The identity
             replaces an invalid matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
         sigma: standard deviation of a pixel coordinate in the caller's pixels, estimated from the inliers, shape
@@ -399,6 +399,7 @@ class PnPResult(NamedTuple):
         """
         from kornia_pnpnet.covariance import pose_covariance, shown_noise
 
+        more = {name: x for name, x in more.items() if x is not None}
         if more.get("focal") == "unknown" and self.intrinsics is not None:
             intrinsics = self.intrinsics
             more.setdefault("dist", self.dist)

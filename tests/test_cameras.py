@@ -131,6 +131,9 @@ def test_sigma_is_that_of_the_pixels_of_a_fisheye(name, uniform, generator):
     for noise, limit in (({}, 0.1), ({"img_sigma": 1.0}, 0.02)):
         result = create_solver(name)(points, pixels, camera, fisheye=0.0 * FISHEYE, **noise)
         assert result.sigma.median().item() == pytest.approx(1.0, abs=limit)
+    call = {"world_points": points, "img_points": pixels, "intrinsics": camera, "fisheye": 0.0 * FISHEYE}
+    shown, given = (result.covariance(**call, **x).diagonal(dim1=1, dim2=2) for x in ({}, {"img_sigma": 1.0}))
+    assert (shown / given).median().item() == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
@@ -237,6 +240,10 @@ def test_rigs(name, cameras, outlier_share, options, base):
     assert right(result, p.pose, 0.05, 0.01).double().mean() > 0.95
     torch.testing.assert_close(result.intrinsics, p.intrinsics)
     assert torch.equal(create_solver(name, **options).with_starts(*p[:3], **p.known)[0].intrinsics, p.intrinsics)
+    there, cameras = torch.arange(24) < 20, p.intrinsics.clone()
+    cameras[:, ~there] = 0.0
+    padded = create_solver(name, **options)(*p[:2], cameras, mask=there.expand(32, -1), **p.known)
+    assert padded.intrinsics.isfinite().all()
 
 
 def test_what_cannot_be_combined_is_refused():

@@ -130,7 +130,7 @@ def test_an_unknown_focal_length_is_that_of_the_result(make_problems):
     noise = {"img_sigma": 1.0, "focal": "unknown"}
     expected = pose_covariance(result.pose, *p[:2], result.intrinsics, **noise, weights=result.inliers.double())
     assert expected.isfinite().all()
-    torch.testing.assert_close(result.covariance(*p[:2], nominal, **noise), expected)
+    torch.testing.assert_close(result.covariance(*p[:2], nominal, **noise, weights=None, dist=None), expected)
     assert pose_covariance(result.pose, *p[:2], nominal, **noise).diagonal(dim1=1, dim2=2).isinf().all()
 
 

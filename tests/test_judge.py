@@ -12,6 +12,7 @@ from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Pose, Status, create_solver, diagnose, p3p, pose_errors, success
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
+from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, _leave_a_line, at_pose, evidence
 from kornia_pnpnet.problem import Noise, Problem, State
 from kornia_pnpnet.refine.residual import project
@@ -56,6 +57,9 @@ def test_copies_share_one_vote():
     votes = Votes.of(twice, twice.weights[:, :1] < 0).pairs
     torch.testing.assert_close(votes.sum(1), torch.full((50,), 12.0, dtype=torch.float64))
     torch.testing.assert_close(found(twice, pose).log_ratio, found(problem, pose).log_ratio, rtol=0.1, atol=2.0)
+    looks = Pose(random_poses(24, torch.Generator().manual_seed(0)).rotation, torch.zeros(24, 3).double())
+    rig = twice._replace(img_points=0.0 * twice.img_points, rig=Pose(*(x.expand(50, *x.shape) for x in looks)))
+    assert (Votes.of(rig, twice.weights[:, :1] < 0).pairs == 1.0).all()  # of bearings: each looks elsewhere
 
 
 @pytest.mark.parametrize("length", [0.3, 1.0, 10.0, 1000.0])

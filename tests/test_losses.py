@@ -1,11 +1,13 @@
 """Errors, success and its interval; distances, the losses over both stages, and that of the true pose's likelihood."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
 from helpers import finite
+from kornia.core.exceptions import BaseError
 from laws import PAIRS, Case, make, make_bad
 from torch.utils import _pytree as pytree
 
@@ -40,6 +42,8 @@ def test_success_needs_both_and_is_strict():
     errors = PoseErrors(torch.tensor([0.5, 2.0]), torch.tensor([0.5, 0.5]))
     for limit in (1, 1.0, np.float32(1.0), np.int64(1), torch.tensor(1.0), torch.ones(2)):
         assert success(errors, max_translation=limit).tolist() == [True, False]
+    with pytest.raises(BaseError, match="max_rotation_deg"):
+        success(errors, torch.ones(2, 1))
 
 
 @pytest.mark.parametrize(("successes", "count", "low", "high"), [(81, 263, 0.2553, 0.3662), (0, 20, 0.0, 0.1611)])
@@ -315,3 +319,6 @@ def test_the_likelihood_of_bad_problems_costs_nothing_and_changes_no_other():
         assert gradient.isfinite().all()
         assert gradient[::2].any()
         assert not gradient[1::2].any()
+    box = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)])[None]
+    centre = Pose(torch.eye(3)[None], torch.zeros(1, 3))  # the camera stands at the centroid
+    assert monte_carlo_pose_loss(centre, centre, box, box[..., :2], torch.eye(3), img_sigma=1.0).item() == 0.0

@@ -10,10 +10,17 @@ from kornia.core.exceptions import BaseError
 from laws import OPENCV, PEERS
 
 from kornia_pnpnet import create_solver, pose_errors, success
+from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.peers import KorniaRs, OpenCVPnP, OpenCVRansac, PeerPose, PeerSolver, PoseLib, PyColmap
 
 pytest.importorskip("cv2")
+
+
+def test_the_cause_of_a_failed_import_is_named():
+    with pytest.raises(ImportError, match="libGL"), needs("eval", "needs OpenCV"):
+        raise ImportError("libGL.so.1: cannot open shared object file")
+
 
 ROBUST = tuple(name for name in PEERS if name not in OPENCV)
 FEW = {"min_iterations": 2, "max_iterations": 4}

@@ -3,9 +3,11 @@
 import hashlib
 import json
 import math
+import os
 import shutil
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -57,6 +59,8 @@ def test_an_unknown_name_is_an_error_that_lists_the_shipped_weights_without_a_ne
     with pytest.raises(FileNotFoundError) as raised:
         PnPNet.from_pretrained(name)
     assert all(shipped in str(raised.value) for shipped in shipped_weights())
+    with pytest.raises(FileNotFoundError):  # a path is no name
+        PnPNet.from_pretrained(Path("pnpnet-set"))
 
 
 def test_weights_of_the_set_network_are_inlier_probabilities():
@@ -122,6 +126,9 @@ def test_content_that_json_does_not_have_leaves_the_old_file(tmp_path, content, 
         write_json(path, content)
     assert json.loads(path.read_text()) == {"a": 1}
     assert [*path.parent.iterdir()] == [path]
+    os.mkfifo(path.with_name("pipe"))
+    with pytest.raises(OSError, match="pipe"):  # it would be replaced by a file
+        write_json(path.with_name("pipe"), {})
 
 
 def test_a_card_names_no_folder_of_a_machine(tmp_path):

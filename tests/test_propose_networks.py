@@ -175,6 +175,9 @@ def test_exact_pairs_give_focal_length_and_pose(name, aspect):
     focal, shift, turn = errors(result, p)
     assert ((focal < 1e-3) & (shift < 1e-3) & (turn < 1e-3) & result.ok).double().mean() > 0.95
     assert torch.allclose(result.intrinsics[:, 1, 1] / result.intrinsics[:, 0, 0], p.intrinsics.new_tensor(aspect))
+    ignored = p.pose._replace(translation=torch.nan * p.pose.translation)
+    result = create_solver(name, focal="unknown")(*p[:2], withheld(p), init=ignored)
+    assert result.ok.double().mean() > 0.9
 
 
 @pytest.mark.parametrize("name", ["p3p-ransac", "pnpnet-set"])

@@ -6,19 +6,23 @@ import math
 import pytest
 import torch
 from helpers import are_rotations, finite
+from torch.testing import assert_close
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, create_solver, pose_errors
+from kornia_pnpnet import EPnP, Normalize, PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, pose_errors
+from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Hypotheses, Problem, State
+from kornia_pnpnet.propose.minimal import SubsetSolver
 from kornia_pnpnet.propose.p3p import P3P, p3p
 from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, draw, samples_needed
-from kornia_pnpnet.propose.scoring import Scene, as_pose
+from kornia_pnpnet.propose.scoring import SCORERS, Scene, as_entries, as_pose
 from kornia_pnpnet.propose.search import Search
 from kornia_pnpnet.refine.residual import project
+from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm
 
 DTYPES = (torch.float64, torch.float32)
 NEAR = 1e-6
@@ -322,6 +326,22 @@ def test_exact_recovery_among_outliers(n, outliers, scorer, make_problems):
     # An outlier may fall on the right place by chance; an inlier is never missed.
     assert (result.weights > 0)[problems.inliers].all()
     assert ((result.weights > 0) & ~problems.inliers).double().mean() < 0.01
+
+
+def test_an_unknown_focal_length_changes_neither_priors_nor_samples(make_problems):
+    p = make_problems(7, 5, noise=False)
+    problem = Normalize(order=False)(*p[:3])[0].map(torch.Tensor.contiguous)
+    one, two = torch.ones_like(problem.weights[:, 0]), 2.0 * problem.focal.expand(5)
+    free = problem._replace(free_focal=CameraTerm(two, None, one, two))
+    solver = SubsetSolver(EPnP(), RobustWeightedLM(3, learnable=False), size=7)
+    assert_close(solver.hypotheses(free).pose, solver.hypotheses(problem).pose)
+    pose, prior = solver.hypotheses(problem).pose, torch.eye(6, dtype=torch.float64).expand(5, 6, 6)
+    prior = PosePrior(map_tensors(lambda x: x[:, 0], pose), prior)
+    term, _ = PoseTerm.of(prior, torch.zeros_like(problem.world_points[:, 0]), one)
+    scene = Scene.of(free._replace(pose_terms=(term,)), Thresholds(one[:, None], 0.0 * one[:, None]), torch.float64)
+    entries = as_entries(pose).mT * torch.tensor([1.0] * 8 + [2.0] * 4).double()[:, None]
+    losses = [x.losses(entries, SCORERS["msac"])[0] for x in (scene, scene._replace(terms=()))]
+    assert_close(*losses)
 
 
 def test_weights_decide_between_two_poses(make_problems):

@@ -178,6 +178,13 @@ def test_an_almost_level_camera_has_a_valid_prior_of_gravity(dtype):
     assert PoseTerm.of(gravity_prior(down, down, 0.02), *(torch.ones_like(down), torch.ones_like(down[:, 0])))[1].all()
 
 
+def test_a_prior_a_third_of_a_turn_away_has_a_gradient():
+    turn = torch.tensor([[[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]], requires_grad=True)
+    here = Pose(torch.eye(3)[None], torch.zeros(1, 3))
+    term, _ = PoseTerm.of(PosePrior(here._replace(rotation=turn), torch.eye(6)[None]), torch.zeros(1, 3), torch.ones(1))
+    assert torch.autograd.grad(term.errors(here)[1], turn)[0].isfinite().all()
+
+
 def test_gradients_of_gravity(generator):
     down = torch.randn(3, 1, 3, generator=generator, dtype=torch.float64)
     sigma = torch.full((1,), 0.02, dtype=torch.float64)

@@ -264,6 +264,8 @@ def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, m
     assert again.config() == solver.config() == solver.with_options().config()
     assert again.options == solver.options
     assert not again.training
+    solver.compile()
+    assert solver.with_options()._run.compiled
     assert_same(again(*p[:3]), solver(*p[:3]))
 
 
@@ -418,4 +420,6 @@ def test_transforms_of_every_solver_of_ours(name):
         return
     close(torch.func.vmap(each)(*problems), torch.stack([each(*x) for x in zip(*problems, strict=True)]), 1e-7)
     by_problem = torch.func.vmap(torch.func.grad(each))(*problems)
+    leaves = [problems[0].clone().requires_grad_(), *problems[1:]]
+    close(torch.autograd.grad(torch.func.vmap(each)(*leaves).sum(), leaves[0])[0], by_problem, 1e-7)
     close((by_problem * directions).flatten(1).sum(1), first, 1e-6)

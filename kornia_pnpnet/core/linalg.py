@@ -12,9 +12,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.autograd.forward_ad import unpack_dual
 
-from kornia_pnpnet.core.performance import are_few, compiling, exporting
+from kornia_pnpnet.core.performance import are_few, compiling, exporting, records
 
 # Number of Jacobi sweeps. Two sweeps of random matrices give a median error of eigenvalues below 1e-9 times the norm.
 _SWEEPS = 2
@@ -64,7 +65,7 @@ def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> T
     Problems that are not finite get the value ``fill``, a number or a tensor with the shape of one problem.
     """
     shape = (-1,) + (1,) * (value.ndim - 1)
-    if torch.is_grad_enabled():  # not `value.requires_grad`, which is false in forward mode
+    if torch.is_grad_enabled() or forward_ad._current_level >= 0:  # forward mode works in `no_grad`, too
         value = torch.where(live.view(shape), value, value.detach())
     return torch.where(finite.view(shape), value, fill).contiguous()
 
@@ -328,7 +329,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         solved = reduce(and_, good)
         return torch.where(solved, torch.stack(substitute(lower, scaled)), 0.0), solved
     batched = plain = damped.permute(2, 0, 1)
-    if differentiated := batched.requires_grad or right.requires_grad or unpack_dual(batched).tangent is not None:
+    if differentiated := records(batched) or records(right) or unpack_dual(batched).tangent is not None:
         plain = batched.detach()
     factor, info = torch.linalg.cholesky_ex(plain)
     factored, original = (x.diagonal(dim1=1, dim2=2) for x in (factor, plain))

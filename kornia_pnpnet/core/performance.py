@@ -80,6 +80,13 @@ def needs_graph(tensors: Iterable[Tensor]) -> bool:
     return torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
 
 
+def records(x: Tensor) -> bool:
+    """Whether autograd records operations on a tensor. In ``vmap``, ``requires_grad`` of the tensor itself is false."""
+    while not compiling() and torch._C._functorch.is_batchedtensor(x):
+        x = torch._C._functorch.get_unwrapped(x)
+    return x.requires_grad
+
+
 _TURN = [threading.RLock()]
 if hasattr(os, "register_at_fork"):  # the lock of a new process is free, even if a thread of its parent holds the lock
     os.register_at_fork(after_in_child=lambda: _TURN.__setitem__(0, threading.RLock()))

@@ -124,13 +124,13 @@ class Votes(NamedTuple):
         """Count copies of pairs. Outliers are uniform on a square of the same variance as the usual pairs' pixels."""
         there = problem.weights > 0
         world, weights = problem.world_points, there.to(problem.weights)
-        cells = torch.cat((problem.img_points / (_PIXEL_CELL * problem.focal), world / _POINT_CELL), -1).round()
+        places, inside = problem.places, world if problem.rig is None else torch.cat((world, problem.centres), -1)
+        cells = torch.cat((places / (_PIXEL_CELL * problem.focal), inside / _POINT_CELL), -1).round()
         # Points are the same only if they are equal: outliers far away can make all other points share one cell.
-        pairs, points = groups(torch.stack((cells, functional.pad(world, (2, 0)))))
+        pairs, points = groups(torch.stack((cells, functional.pad(world, (cells.shape[-1] - 3, 0)))))
         pairs = weights / totals(pairs, weights).clamp(min=1.0)
         usual = (problem.usual_weights > 0).to(problem.weights)[..., None]
         share = usual / usual.sum(1, keepdim=True).clamp(min=1.0)
-        places = problem.places
         variance = (share * (places - (share * places).sum(1, keepdim=True)).square()).sum((1, 2))[:, None]
         area = 6.0 * variance + (LEAST_NOISE * problem.focal).square()
         return cls(pairs, points, known, 2.0 * math.pi / (1.0 - _TAIL) / area)

@@ -29,10 +29,6 @@ class Thresholds(NamedTuple):
     img: Tensor
     world: Tensor
 
-    def sq_limits(self, projection: Projection) -> Tensor:
-        """Squared radius (px²) of the inlier disc, (B, N)."""
-        return self.img.square() + ((projection.focal * projection.inv_depth).mT * self.world).square()
-
 
 class Judged(NamedTuple):
     r"""Inliers and residuals of one pose per problem.
@@ -58,7 +54,7 @@ def judge(projection: Projection, problem: Problem, thresholds: Thresholds) -> J
         >>> judge(projection, problem, Thresholds(torch.tensor([[10.0]]), torch.tensor([[0.0]])))
         Judged(weights=tensor([[1., 0.]]), errors=tensor([[0.0000, 6.2500]]))
     """
-    sq_limit = thresholds.sq_limits(projection)
+    sq_limit = thresholds.img.square() + ((projection.focal * projection.inv_depth).mT * thresholds.world).square()
     errors = torch.where(projection.in_front, projection.sq_residual / sq_limit, MAX_ERROR)
     inlier = (errors < 1.0) & (problem.weights > 0)
     return Judged(torch.where(inlier, thresholds.img.square() / sq_limit, 0.0), errors)

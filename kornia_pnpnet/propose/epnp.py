@@ -29,6 +29,7 @@ from kornia_pnpnet.core.linalg import (
     solve_leading,
     solve_positive,
 )
+from kornia_pnpnet.core.performance import records
 from kornia_pnpnet.problem import Problem, Starts
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.result import Pose
@@ -148,7 +149,7 @@ class EPnP(Initialiser):
         system = _depth_system(control, problem, self.algebraic_weight)
         with torch.no_grad():
             depths, solved = self._depths(system)
-        if system.prior.requires_grad:
+        if records(system.prior):
             depths = _attach_gradient(system, depths, control.planar)
 
         camera = _in_camera(system, depths)[:, :, 0]  # (3, 4, B)

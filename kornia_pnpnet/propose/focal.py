@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from kornia_pnpnet.cameras import focal_length, pinholes, with_undistorted
 from kornia_pnpnet.core.performance import ranked
-from kornia_pnpnet.core.trees import put, take
+from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
@@ -110,7 +110,10 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
         inputs = _zoomed(inputs, camera[:, 0])
         inputs = with_undistorted(inputs, as_dist(camera[:, 1:]), None)
         inputs = inputs._replace(radial=camera[:, 1:], lens_scale=None)  # the refinement distorts the pixels again
-    return inputs._replace(init=pose if inputs.init is None else inputs.init)
+    if inputs.init is not None:  # a given pose that is not finite is ignored
+        sound = torch.cat((inputs.init.rotation.flatten(1), inputs.init.translation), 1).isfinite().all(1)
+        pose = map_tensors(lambda x, y: torch.where(sound.view(-1, *(1,) * (x.ndim - 1)), x, y), inputs.init, pose)
+    return inputs._replace(init=pose)
 
 
 @torch.no_grad()

@@ -58,6 +58,7 @@ class SubsetSolver(Configured):
 
     def hypotheses(self, problem: Problem) -> Hypotheses:
         """Find one pose per sample. A pose is valid if the pose is finite and the start is ``ok``."""
+        problem = problem._replace(free_focal=None)  # the pose is scored with the focal length of the problem
         starts = self.init(problem)
         pose = starts.pose if self.refine is None else self.refine(problem, starts).pose
         valid = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)

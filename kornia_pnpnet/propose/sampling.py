@@ -159,7 +159,7 @@ class Samples:
         if self._numbers is not None:
             drawn = draw(self._numbers[start:stop], self._upper[problems])
             ranks = torch.where(self._enumerated[problems, None, None], ranks, drawn)
-        return self._present(problems, ranks)
+        return self._order[problems].gather(1, ranks.flatten(1)).view_as(ranks)
 
     def needed(self, problems: Tensor, inliers: Tensor, confidence: float) -> Tensor:
         """Apply :func:`samples_needed` to some problems (P,), given the inliers (P, N) of their best poses.
@@ -175,11 +175,7 @@ class Samples:
         """Indices (P, count) of the pairs at evenly spaced values of the cumulative chances."""
         at = (torch.arange(count, dtype=torch.float64, device=problems.device) + 0.5) / count
         ranks = torch.searchsorted(self._upper[problems], at.expand(len(problems), -1).contiguous(), right=True)
-        return self._present(problems, ranks.clamp(max=self._upper.shape[1] - 1))
-
-    def _present(self, problems: Tensor, ranks: Tensor) -> Tensor:
-        """Convert ranks (P, ...) among the pairs of positive chance to positions in the problems."""
-        return self._order[problems].gather(1, ranks.flatten(1)).view_as(ranks)
+        return self._order[problems].gather(1, ranks.clamp(max=self._upper.shape[1] - 1))
 
 
 @lru_cache(maxsize=64)

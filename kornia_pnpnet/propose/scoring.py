@@ -67,12 +67,14 @@ class Scene(NamedTuple):
         weights: weights of the pairs, see :meth:`of`, shape :math:`(P, 1, N)`.
         sq_world: :math:`\omega^2`, shape :math:`(P, 1, 1)` or :math:`(P, N, 1)`.
         terms: priors of the poses.
+        zoomed: whether the last row of a pose is multiplied by a ratio of focal lengths, see ``Search``.
     """
 
     rows: Tensor
     weights: Tensor
     sq_world: Tensor
     terms: tuple[Term, ...] = ()
+    zoomed: bool = False
 
     @classmethod
     def of(cls, problem: Problem, thresholds: Thresholds, dtype: torch.dtype) -> Scene:
@@ -100,6 +102,7 @@ class Scene(NamedTuple):
             weights[:, None],
             thresholds.world.square()[..., None] + torch.finfo(dtype).tiny,  # avoids 0/0 at the camera centre
             problem.pose_terms,
+            problem.free_focal is not None,
         )
         return map_tensors(lambda x: x.to(dtype), scene)
 
@@ -115,8 +118,12 @@ class Scene(NamedTuple):
         """
         errors = self.errors(poses)
         losses = [(self.weights @ scorer(errors if by == 1.0 else errors / by))[:, 0] for by in (1.0, *wider)]
+        pose = as_pose(poses.mT)
+        if self.zoomed and self.terms:
+            zoom = functional.pad(pose.rotation[..., 2:, :].norm(dim=-1, keepdim=True), (0, 0, 2, 0), value=1.0)
+            pose = Pose(pose.rotation / zoom, pose.translation / zoom[..., 0])
         for term in map_tensors(lambda x: x[:, None], self.terms):  # broadcasts over H poses
-            penalty = term.disagreement(as_pose(poses.mT))
+            penalty = term.disagreement(pose)
             losses = [x + penalty for x in losses]
         return losses
 

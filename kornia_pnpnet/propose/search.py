@@ -281,6 +281,7 @@ class Search:
             best = best // _KEPT_ONE_IN
             kept = torch.where(2 * pairs <= present, best.clamp(min=_IMPROVED), kept)
             losses = scene.pairs(self.samples.spread(problems, pairs)).losses(poses, self.plan.score)[0]
+            losses = losses * (2 * pairs <= present)[:, None]  # equal losses keep the order of the poses
             _, poses, valid = self._best_of(losses, poses, valid, int(kept.max()))
             valid = valid & (torch.arange(valid.shape[1], device=valid.device) < kept[:, None])
             pairs *= _MORE
@@ -314,7 +315,8 @@ class Search:
         losses = losses.masked_fill(~valid, torch.inf)
         # Of equal losses, which are frequent, the first wins. `topk` alone would choose by the width of the batch.
         places = torch.arange(1, losses.shape[1] + 1, dtype=losses.dtype, device=losses.device)
-        keys = losses.addcmul(losses, places, value=2.0 * torch.finfo(losses.dtype).eps)
+        keys = losses.clamp(min=torch.finfo(losses.dtype).tiny ** 0.5)
+        keys = keys.addcmul(keys, places, value=2.0 * torch.finfo(losses.dtype).eps)
         order = keys.topk(min(width, losses.shape[1]), largest=False).indices
         return losses.gather(1, order), poses.gather(2, order[:, None].expand(-1, 12, -1)), valid.gather(1, order)
 

@@ -196,10 +196,10 @@ class PoseTerm(NamedTuple):
         free = self.free
         along = turn.diagonal(dim1=-2, dim2=-1).sum(-1) - (free * (turn @ free[..., None])[..., 0]).sum(-1)
         around = -(free * So3.vee(turn - turn.mT)).sum(-1)
-        length = torch.hypot(along, around)
-        sound = length > torch.finfo(length.dtype).eps
-        length = torch.where(sound, length, 1.0)
-        cosine, sine = torch.where(sound, along / length, 1.0), torch.where(sound, around / length, 0.0)
+        sound = torch.hypot(along.detach(), around.detach()) > torch.finfo(along.dtype).eps
+        along, around = torch.where(sound, along, 1.0), torch.where(sound, around, 0.0)
+        length = torch.hypot(along, around)  # not 0, where its gradient would be NaN
+        cosine, sine = along / length, around / length
         axis = So3.hat(free.flatten(0, -2)).unflatten(0, free.shape[:-1])
         turn = turn + sine[..., None, None] * (axis @ turn) + (1.0 - cosine)[..., None, None] * (axis @ (axis @ turn))
         shift = self.pose.translation - pose.translation
