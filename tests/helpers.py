@@ -143,17 +143,10 @@ def make_view(name="a.jpg", count=30, seed=0):
     _, rotation, translation = pose_of(seed)
     plane = rng.uniform(-0.5, 0.5, (count, 2))
     cam = np.hstack([plane, np.ones((count, 1))]) * rng.uniform(2, 8, (count, 1))
-    return View(
-        name=name,
-        world_points=torch.tensor((cam - translation) @ rotation),
-        img_points=torch.tensor(FOCAL * plane + CENTRE),
-        intrinsics=torch.tensor([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]], dtype=torch.float64),
-        rotation=torch.tensor(rotation),
-        translation=torch.tensor(translation),
-        width=WIDTH,
-        height=HEIGHT,
-        inliers=torch.ones(count, dtype=torch.bool),
-    )
+    intrinsics = torch.tensor([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]], dtype=torch.float64)
+    arrays = (cam - translation) @ rotation, FOCAL * plane + CENTRE, rotation, translation
+    world, img, *pose = map(torch.tensor, arrays)
+    return View(name, world, img, intrinsics, *pose, WIDTH, HEIGHT, torch.ones(count, dtype=torch.bool))
 
 
 def make_scene(*counts):

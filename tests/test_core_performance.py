@@ -266,18 +266,12 @@ TIES = torch.tensor([[3.0, 1.0, 1.0, -2.0, 3.0, 0.0], [0.0, -0.0, torch.inf, -to
 @pytest.mark.parametrize(
     ("function", "inputs"),
     [
-        (torch.matmul, (A, B[0])),
-        (torch.mm, (A[0], B[0])),
-        (torch.bmm, (A, B)),
+        *((torch.matmul, (A, B[0])), (torch.mm, (A[0], B[0])), (torch.bmm, (A, B))),
         (lambda bias, a, b: torch.addmm(bias, a, b, beta=0.5, alpha=2.0), (B[0, :1], A[0], B[0])),
-        (nn.functional.linear, (A, B[0].T, B[0, 0])),
-        (nn.functional.linear, (A, B[0].T)),
-        (lambda x: (x > 0).cumsum(-1), (A,)),
-        (lambda x: x.cumsum(0, dtype=torch.float64), (A,)),
-        (lambda x: x.sort(stable=True), (TIES,)),
-        (lambda x: x.sort(dim=0, descending=True, stable=True), (TIES,)),
-        (lambda x: x.topk(3, 1), (A.mT,)),
-        (lambda x: x.topk(2, 1, largest=False), (A,)),
+        *((nn.functional.linear, (A, *more)) for more in ((B[0].T, B[0, 0]), (B[0].T,))),
+        *((lambda x: (x > 0).cumsum(-1), (A,)), (lambda x: x.cumsum(0, dtype=torch.float64), (A,))),
+        *((lambda x: x.sort(stable=True), (TIES,)), (lambda x: x.sort(dim=0, descending=True, stable=True), (TIES,))),
+        *((lambda x: x.topk(3, 1), (A.mT,)), (lambda x: x.topk(2, 1, largest=False), (A,))),
     ],
 )
 def test_operations_that_are_inlined_give_the_same_results(function, inputs):

@@ -6,26 +6,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import helpers
 import numpy as np
 import pytest
 import torch
-from helpers import (
-    CENTRE,
-    FOCAL,
-    HEIGHT,
-    WIDTH,
-    assert_counts,
-    assert_uniform,
-    damage,
-    finite,
-    make_scene,
-    make_view,
-    many,
-    match_arrays,
-    names_the_file,
-    pose_of,
-    reprojection_errors,
-)
+from helpers import CENTRE, FOCAL, HEIGHT, WIDTH, assert_uniform, make_scene, make_view, many, match_arrays, pose_of
 from hypothesis import given
 from hypothesis import strategies as st
 from kornia.core.exceptions import BaseError
@@ -217,13 +202,13 @@ def test_damaged_scenes_are_an_error_of_ours(tmp_path, pycolmap):
     @given(st.sampled_from([*sound_files, matches]), st.data())
     def run(file, data):
         path = matches if file == matches else model
-        file.write_bytes(data.draw(damage(sound_files[file])))
+        file.write_bytes(data.draw(helpers.damage(sound_files[file])))
         try:
             scene = load_scene(path)
         except (ValueError, OSError) as error:
-            names_the_file(error, path)
+            helpers.names_the_file(error, path)
         else:
-            finite(*((view.world_points, view.img_points, view.rotation, view.translation) for view in scene.views))
+            helpers.finite(*((x.world_points, x.img_points, x.rotation, x.translation) for x in scene.views))
         finally:
             file.write_bytes(sound_files[file])
 
@@ -353,7 +338,7 @@ def test_inliers_reproject_exactly_and_mismatches_of_the_scene_are_marked():
         inliers = torch.arange(len(view.inliers)) % 4 != 0
         views.append(replace(view, img_points=view.img_points + 100.0 * ~inliers[:, None], inliers=inliers))
     problems = SceneProblems(Scene("toy", tuple(views)), batch_size=500).batch(0)
-    assert torch.equal(reprojection_errors(problems).norm(dim=-1) < 1e-9, problems.inliers)
+    assert torch.equal(helpers.reprojection_errors(problems).norm(dim=-1) < 1e-9, problems.inliers)
     assert_close(problems.inliers.double().mean().item(), 0.75, rtol=0, atol=0.03)
 
 
@@ -361,7 +346,7 @@ def test_images_are_equally_likely_and_small_ones_unused():
     scene = make_scene(10, 500, 9)
     source = SceneProblems(scene, batch_size=4000)
     assert [view.name for view in source.views] == ["0.jpg", "1.jpg"]
-    assert_counts((pairs_of(scene, source.batch(0).img_points[:, 0]) >= 10).long().bincount())
+    helpers.assert_counts((pairs_of(scene, source.batch(0).img_points[:, 0]) >= 10).long().bincount())
 
 
 def test_points_of_an_image_are_a_uniform_ordered_choice_without_repetition():

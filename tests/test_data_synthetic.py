@@ -89,7 +89,6 @@ def test_heavy_tails_keep_the_sigma_of_the_bulk():
         # The squared length of bivariate Student noise: P(r^2 > x) = (1 + x / degrees)^(-degrees / 2).
         assert_uniform((1 + length.square() / degrees) ** (-degrees / 2), 0.0, 1.0)
         assert torch.equal(inliers, length <= 10.0)
-        assert inliers.all() == (length.max() <= 10.0)
     normal, few, many = (lengths(degrees)[0].flatten() for degrees in (0.0, 2.0, 1000.0))
     assert few.quantile(0.2).item() == pytest.approx(normal.quantile(0.2).item(), rel=0.1)
     assert few.quantile(0.95) > 1.9 * normal.quantile(0.95)
@@ -306,9 +305,7 @@ def test_crowds_share_few_pixels():
 def test_crowds_of_a_point_have_many_pixels():
     mix = OutlierMix(count=30, crowd_share=1.0, max_crowds=3, point_crowd_share=0.25)
     p = draw(40, 2000, outliers=mix, world_sigma=0.0)
-    points, pixels = (
-        ((x[:, :, None] == x[:, None]).all(-1).sum(-1) > 1).any(-1) for x in (p.world_points, p.img_points)
-    )
+    points, pixels = (((x[:, :, None] == x[:, None]).all(-1).sum(-1) > 1).any(-1) for x in p[:2])
     assert not (points & pixels).any()
     assert_counts(torch.stack((points.sum(), pixels.sum())), (0.25, 0.75))
     assert reprojection_errors(p)[p.inliers].norm(dim=-1).max() < 6

@@ -149,11 +149,8 @@ def test_other_files_are_refused(tmp_path, content):
         *(("rows.0.success.rate", value) for value in (1.5, math.nan)),
         *(("rows.0.success.total", value) for value in (0.5, 2**63)),
         *(("rows.0.us_per_problem", value) for value in ("1", 10**400)),
-        ("rows.0.solver", "t"),
-        ("rows.0.per_problem.ok", 1),
+        *(("rows.0.solver", "t"), ("rows.0.per_problem.ok", 1), ("data.clean.n", None), ("data", [])),
         ("rows.0.per_problem", {"rotation_error_deg": [], "translation_error": [0.0], "ok": [1]}),
-        ("data.clean.n", None),
-        ("data", []),
     ],
 )
 def test_the_wrong_entry_of_a_file_is_named(evaluated, place, value, path):

@@ -40,10 +40,8 @@ OWNERS = {
 #: What importing the package must not import: the extras, which a user of the layer need not have.
 EXTRAS = [*OWNERS, "lightning_fabric", "omegaconf", "seaborn"]
 
-MODULES = {
-    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
-    for path in sorted(ROOT.rglob("*.py"))
-}
+FILES = sorted(ROOT.rglob("*.py"))
+MODULES = {".".join(x.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): x for x in FILES}
 
 #: Methods for users may call a function of a higher layer: ``result.covariance(…)`` calls ``pose_covariance``.
 SHORTCUTS = {(MODULES["result"], "covariance")}

@@ -154,18 +154,15 @@ def test_a_step_against_the_gradient_lowers_the_loss_of_problems_that_are_not_ok
         assert (losses(pixels - step) < before).float().mean() > 0.95
 
 
+@pytest.mark.filterwarnings("error:No problem of the first 8 batches")  # pyproject.toml ignores it in other tests
 def test_a_training_without_a_gradient_warns_once(make_problems, generator):
     p = make_problems()
     wrong = (2000.0 * torch.rand(p.img_points.shape, generator=generator, dtype=torch.float64)).requires_grad_()
     right = p.img_points.clone().requires_grad_()
     solver = create_solver("pnpnet-set", effort="fixed")
-    for options in ({"gradient": "always"}, {"first_stage_only": True}):
-        for _ in range(10):
-            solver(p.world_points, wrong, p.intrinsics, **options)
-    for _ in range(10):
-        solver(p.world_points, wrong.detach(), p.intrinsics)
-    for _ in range(7):
-        solver(p.world_points, wrong, p.intrinsics)
+    calls = (wrong, {"gradient": "always"}), (wrong, {"first_stage_only": True}), (wrong.detach(), {})
+    for pixels, options in (*(call for call in calls for _ in range(10)), *[(wrong, {})] * 7):
+        solver(p.world_points, pixels, p.intrinsics, **options)
     with pytest.warns(RuntimeWarning, match="monte_carlo_pose_loss"):
         solver(p.world_points, wrong, p.intrinsics)
     solver(p.world_points, wrong, p.intrinsics)
@@ -363,7 +360,7 @@ def test_solvers_stay_where_their_inputs_are(name, make_problems):
 @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
 @pytest.mark.parametrize("name", [x for x in k.list_solvers() if x not in PEERS])
-def test_transforms_of_every_solver_of_ours(name):
+def test_transforms_of_every_solver_of_ours(name, generator):
     """First derivatives against ``backward``, second against central differences of it, ``vmap`` against a loop."""
     # Pixels move along three directions. Where the pose is found from a start that is a constant, derivatives leave out
     # what the start would change, which the last iterations nearly forget: hence the tolerance of second derivatives.
@@ -372,18 +369,15 @@ def test_transforms_of_every_solver_of_ours(name):
     chosen |= {"pnpnet-set": {"m": 8, "effort": "fixed"}, "ransac-epnp-lm": {"max_samples": 20}}.get(name, {})
     p = SyntheticProblems(n=int(number[1]) if number else 8, batch_size=2, seed=3, dtype=torch.float64).batch(0)
     solver = create_solver(name, **chosen).double()
-    generator = torch.Generator().manual_seed(0)
     directions = torch.randn(3, *p.img_points.shape, generator=generator).double()
     mixture = torch.randn(24, generator=generator).double()
 
     def outputs(world_points, img_points, intrinsics):
         result = solver(world_points, img_points, intrinsics)
-        parts = (*result.pose, *result.init)
-        return torch.cat([x.flatten(-2) if x.shape[-2:] == (3, 3) else x for x in parts], -1)
+        return torch.cat([x.flatten(-2) if x.shape[-2:] == (3, 3) else x for x in (*result.pose, *result.init)], -1)
 
     def moved(shift):
-        img_points = p.img_points + (shift[:, None, None, None] * directions).sum(0)
-        return outputs(p.world_points, img_points, p.intrinsics)
+        return outputs(p.world_points, p.img_points + (shift[:, None, None, None] * directions).sum(0), p.intrinsics)
 
     def loss(shift):
         return (moved(shift) @ mixture).sum()

@@ -244,26 +244,17 @@ def swept(experiment):
 # An experiment alone, with all data, or with the first and the last value of each override that its sweeper runs over.
 CASES = [(name, ()) for name in EXPERIMENTS if not swept(name)]
 CASES += [("set", (f"data={data}", "model.n=12")) for data in DATA]
-CASES += [
-    (name, (f"{key}={value}",))
-    for name in EXPERIMENTS
-    for key, values in swept(name).items()
-    for value in dict.fromkeys((values[0], values[-1]))
-]
+SWEPT = [(name, key, values) for name in EXPERIMENTS for key, values in swept(name).items()]
+CASES += [(name, (f"{key}={x}",)) for name, key, values in SWEPT for x in dict.fromkeys((values[0], values[-1]))]
 
 
 def fit_config(config, folder, solver=None):
     """Train what a composed configuration describes, as ``train.py`` does, or another solver in its place."""
-    return fit(
-        instantiate(config.model.solver) if solver is None else solver,
-        instantiate(config.data.train),
-        {name: instantiate(source).batch(0) for name, source in config.data.validation.items()},
-        instantiate(config.loss),
-        instantiate(config.train, _convert_="all"),
-        folder,
-        fabric=instantiate(config.engine),
-        progress=False,
-    )
+    solver = instantiate(config.model.solver) if solver is None else solver
+    data, loss, fabric = (instantiate(x) for x in (config.data.train, config.loss, config.engine))
+    sets = {name: instantiate(source).batch(0) for name, source in config.data.validation.items()}
+    settings = instantiate(config.train, _convert_="all")
+    return fit(solver, data, sets, loss, settings, folder, fabric=fabric, progress=False)
 
 
 @pytest.mark.parametrize(("experiment", "overrides"), CASES)

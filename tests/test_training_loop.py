@@ -33,14 +33,11 @@ pytestmark = forks = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of
 def make_parts(updates=6, dtype=torch.float32, **changes):
     torch.manual_seed(0)
     settings = {"warmup": 1, "log_every": 1, "validate_every": 3, "checkpoint_every": 2, "ramp": (0.2, 0.5), **changes}
-    return {
-        "model": PnPNet(MLPInit(6), RobustWeightedLM(2)).to(dtype),
-        "data": SyntheticProblems(n=6, batch_size=16, seed=3, outliers=OutlierMix(), dtype=dtype),
-        "validation": {"none": SyntheticProblems(n=6, batch_size=32, seed=4, dtype=dtype).batch(0)},
-        "loss": PoseLoss(saturation=0.02),
-        "settings": TrainSettings(updates, **settings),
-        "progress": False,
-    }
+    model, loss = PnPNet(MLPInit(6), RobustWeightedLM(2)).to(dtype), PoseLoss(saturation=0.02)
+    data = SyntheticProblems(n=6, batch_size=16, seed=3, outliers=OutlierMix(), dtype=dtype)
+    sets = {"none": SyntheticProblems(n=6, batch_size=32, seed=4, dtype=dtype).batch(0)}
+    parts = {"model": model, "data": data, "validation": sets, "loss": loss, "progress": False}
+    return parts | {"settings": TrainSettings(updates, **settings)}
 
 
 def read_history(folder):
