@@ -21,7 +21,7 @@ from kornia_pnpnet.core.checks import (
     expand_sigma,
 )
 from kornia_pnpnet.core.performance import full_precision, present_first, sees_values
-from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, equivalent_sigma
+from kornia_pnpnet.core.symmetric import equivalent_sigma, symmetric
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Noise
 from kornia_pnpnet.result import PnPResult, Pose, PosePrior, camera_matrices, with_rotation
@@ -140,17 +140,14 @@ def _checked_noise(
     world_cov: Tensor | None,
 ) -> Noise | None:
     """Return the noise of every pair in the dtype of ``world_points``, or ``None`` if the caller gave no noise."""
-    kinds: dict[str, tuple[Any, Any, Any]] = {
-        "img": (img_sigma, img_cov, Symmetric2),
-        "world": (world_sigma, world_cov, Symmetric3),
-    }
-    if all(sigma is None and cov is None for sigma, cov, _ in kinds.values()):
+    kinds = ("img", img_sigma, img_cov), ("world", world_sigma, world_cov)
+    if all(sigma is None and cov is None for _, sigma, cov in kinds):
         return None
     noise: dict[str, Any] = {}
-    for name, (sigma, cov, form) in kinds.items():
+    for name, sigma, cov in kinds:
         if sigma is not None and cov is not None:
             raise ValueCheckError(f"Give {name}_sigma or {name}_cov, not both.")
-        matrix = None if cov is None else form.of(cov.to(world_points.dtype))
+        matrix = None if cov is None else symmetric(cov.to(world_points.dtype))
         noise[name] = equivalent_sigma(matrix) if matrix else expand_sigma(f"{name}_sigma", sigma, world_points)
         noise[f"{name}_cov"] = matrix
     return Noise(**noise)

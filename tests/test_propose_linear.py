@@ -7,7 +7,7 @@ from helpers import finite, rate
 from kornia_pnpnet import Pose, create_solver, pose_errors, success
 from kornia_pnpnet.core import linalg
 from kornia_pnpnet.core.linalg import align, nearest_rotation, solve_leading, solve_positive
-from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3, are_semi_definite, equivalent_sigma
+from kornia_pnpnet.core.symmetric import are_semi_definite, equivalent_sigma, symmetric
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.refine.residual import rotation_angle
 
@@ -248,9 +248,6 @@ def test_gradients_are_finite_for_any_size_of_the_matrix(count):
         assert matrix.grad.isfinite().all()
 
 
-KINDS = {2: Symmetric2, 3: Symmetric3}
-
-
 def matrices(size, eigenvalues=None):
     generator = torch.Generator().manual_seed(size)
     turn = torch.linalg.qr(torch.randn(200, size, size, generator=generator, dtype=torch.float64)).Q
@@ -264,17 +261,17 @@ def matrices(size, eigenvalues=None):
 def test_semi_definite_is_told_up_to_rounding(size, dtype):
     for smallest, expected in ((0.0, True), (1e-3, True), (-1e-3, False), (torch.nan, False), (torch.inf, False)):
         matrix = matrices(size, eigenvalues=[1.0, 1.0, smallest][-size:]).to(dtype)
-        assert (are_semi_definite(KINDS[size].of(matrix)) == expected).all(), smallest
-        assert not are_semi_definite(KINDS[size].of(-matrix)).any()
-    assert are_semi_definite(KINDS[size].of(torch.zeros(1, size, size, dtype=dtype))).all()
+        assert (are_semi_definite(symmetric(matrix)) == expected).all(), smallest
+        assert not are_semi_definite(symmetric(-matrix)).any()
+    assert are_semi_definite(symmetric(torch.zeros(1, size, size, dtype=dtype))).all()
 
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_the_equivalent_sigma_has_the_same_trace(size):
     matrix = matrices(size)
-    sigma = equivalent_sigma(KINDS[size].of(matrix))
+    sigma = equivalent_sigma(symmetric(matrix))
     torch.testing.assert_close(size * sigma.square(), matrix.diagonal(dim1=1, dim2=2).sum(-1))
     zero = torch.zeros(1, size, size, requires_grad=True)
-    equivalent_sigma(KINDS[size].of(zero)).sum().backward()
+    equivalent_sigma(symmetric(zero)).sum().backward()
     assert (zero.grad == 0).all()
-    assert equivalent_sigma(KINDS[size].of(torch.full((1, size, size), torch.nan))).isnan().all()
+    assert equivalent_sigma(symmetric(torch.full((1, size, size), torch.nan))).isnan().all()

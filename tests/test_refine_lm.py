@@ -9,7 +9,7 @@ from helpers import assert_same, reprojection_errors, verified_derivative
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 
 from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, pose_errors
-from kornia_pnpnet.core.symmetric import Symmetric2
+from kornia_pnpnet.core.symmetric import symmetric
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.problem import Problem, State
 from kornia_pnpnet.refine import residual
@@ -282,7 +282,7 @@ def test_normal_equations_are_those_of_the_derivative(camera, unknown, few, rand
     root = torch.randn(7, 9, 2, 2, generator=generator, dtype=torch.float64)
     for matrices in (root @ root.mT, torch.eye(2) * root[..., :1, :1].square()):
         is_scalar = not matrices[..., 0, 1].any()
-        weights = matrices[..., 0, 0] if is_scalar else Symmetric2.of(matrices)
+        weights = matrices[..., 0, 0] if is_scalar else symmetric(matrices)
         found = normal_equations(projection, problem, weights)
         left = torch.einsum("buni,bnuv->bvni", jacobian, matrices * projection.in_front[..., None, None])
         focal = projection.focal.expand(7)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,11 +23,6 @@ class Symmetric2(NamedTuple):
     uu: Tensor
     uv: Tensor
     vv: Tensor
-
-    @classmethod
-    def of(cls, matrix: Tensor) -> Symmetric2:
-        """The symmetric parts of matrices (..., 2, 2)."""
-        return cls(*_upper(matrix))
 
     @property
     def determinant(self) -> Tensor:
@@ -70,11 +65,6 @@ class Symmetric3(NamedTuple):
     yz: Tensor
     zz: Tensor
 
-    @classmethod
-    def of(cls, matrix: Tensor) -> Symmetric3:
-        """The symmetric parts of matrices (..., 3, 3)."""
-        return cls(*_upper(matrix))
-
     def divided(self, length: Tensor) -> Symmetric3:
         """Divide a covariance by a squared length, and add more than the rounding errors to the diagonal."""
         # `length` gets no gradient from zero entries: the gradient would be NaN if the square of `length` underflowed.
@@ -90,11 +80,10 @@ class Symmetric3(NamedTuple):
         return [torch.addcmul(torch.addcmul(i * a, j, b), k, c) for i, j, k in rows]
 
 
-def _upper(matrix: Tensor) -> list[Tensor]:
-    """The upper triangles of the symmetric parts of matrices (..., K, K), row by row."""
-    size = range(matrix.shape[-1])
-    half = 0.5 * (matrix + matrix.mT)
-    return [half[..., i, j] for i in size for j in size[i:]]
+def symmetric(matrix: Tensor) -> Any:
+    """The symmetric parts of matrices (..., K, K) with K = 2 or 3, as :class:`Symmetric2` or :class:`Symmetric3`."""
+    size, half = range(matrix.shape[-1]), 0.5 * (matrix + matrix.mT)
+    return (Symmetric2 if len(size) == 2 else Symmetric3)(*(half[..., i, j] for i in size for j in size[i:]))
 
 
 def _lower_rows(matrix: Symmetric2 | Symmetric3) -> list[list[Tensor]]:
