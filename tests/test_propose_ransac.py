@@ -8,12 +8,13 @@ import torch
 from helpers import are_rotations, finite
 from torch.testing import assert_close
 
-from kornia_pnpnet import EPnP, Normalize, PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, pose_errors
+from kornia_pnpnet import Normalize, PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, pose_errors
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.judge.inliers import Thresholds, judge
 from kornia_pnpnet.problem import Hypotheses, Problem, State
+from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.propose.minimal import SubsetSolver
 from kornia_pnpnet.propose.p3p import P3P, p3p
 from kornia_pnpnet.propose.p3p_rig import P3PRig

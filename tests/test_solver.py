@@ -261,9 +261,9 @@ def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, m
     assert again.config() == solver.config() == solver.with_options().config()
     assert again.options == solver.options
     assert not again.training
+    assert_same(again(*p[:3]), solver(*p[:3]))
     solver.compile()
     assert solver.with_options()._run.compiled
-    assert_same(again(*p[:3]), solver(*p[:3]))
 
 
 #: What a random damage, of which ``test_interruptions.py`` tries many, does not do.
