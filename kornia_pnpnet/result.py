@@ -320,8 +320,8 @@ class PnPResult(NamedTuple):
             libraries return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; empty unless the call requested alternatives.
         intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`. In a rig the shape may be
-            :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. The identity
-            replaces an invalid matrix.
+            :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. The identity replaces an invalid
+            matrix.
         dist: estimated distortion (k1, k2, 0, 0), shape :math:`(B, 4)`; 0 if no distortion was estimated.
         sigma: standard deviation of a pixel coordinate in the caller's pixels, estimated from the inliers, shape
             :math:`(B,)`, without gradient. The noise of world points is included. If the standard deviation differs

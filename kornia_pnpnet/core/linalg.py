@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.autograd.forward_ad import unpack_dual
 
 from kornia_pnpnet.core.performance import are_few, compiling, exporting, records
 
@@ -329,7 +328,7 @@ def solve_positive(matrix: Tensor, right: Tensor, damping: Tensor) -> tuple[Tens
         solved = reduce(and_, good)
         return torch.where(solved, torch.stack(substitute(lower, scaled)), 0.0), solved
     batched = plain = damped.permute(2, 0, 1)
-    if differentiated := records(batched) or records(right) or unpack_dual(batched).tangent is not None:
+    if differentiated := records(batched) or records(right) or forward_ad.unpack_dual(batched).tangent is not None:
         plain = batched.detach()
     factor, info = torch.linalg.cholesky_ex(plain)
     factored, original = (x.diagonal(dim1=1, dim2=2) for x in (factor, plain))

@@ -118,8 +118,10 @@ class Scene(NamedTuple):
         """
         errors = self.errors(poses)
         losses = [(self.weights @ scorer(errors if by == 1.0 else errors / by))[:, 0] for by in (1.0, *wider)]
+        if not self.terms:
+            return losses
         pose = as_pose(poses.mT)
-        if self.zoomed and self.terms:
+        if self.zoomed:
             zoom = functional.pad(pose.rotation[..., 2:, :].norm(dim=-1, keepdim=True), (0, 0, 2, 0), value=1.0)
             pose = Pose(pose.rotation / zoom, pose.translation / zoom[..., 0])
         for term in map_tensors(lambda x: x[:, None], self.terms):  # broadcasts over H poses
