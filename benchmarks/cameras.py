@@ -42,8 +42,6 @@ SCENES = (
 SCENE_N, SCENE_OUTLIERS = 20, (0, 5, 10)
 # A prior of the focal length without information: the oracle starts from the true one.
 _OPEN = 1e3
-# Problems that the other libraries solve one by one: with 80 % outliers each takes 25 ms.
-FEW = 200
 THRESHOLD, RIG_THRESHOLD = 12.0, 10.0
 
 
@@ -87,10 +85,12 @@ def oracle(problems: Problems) -> Found:
 
 def one_by_one(solve: Callable[..., tuple[np.ndarray, float] | None], *inputs: Tensor) -> Found:
     """Call a function for each problem, which returns the pose (3, 4) and the focal length, or ``None``."""
-    arrays = [x.double().numpy() for x in inputs]
-    start = time.perf_counter()
-    found = [solve(*one) for one in zip(*arrays, strict=True)]
-    us = 1e6 * (time.perf_counter() - start) / len(found)
+    problems = list(zip(*(x.double().numpy() for x in inputs), strict=True))
+    with harness.threads():
+        solve(*problems[0])  # not timed
+        start = time.perf_counter()
+        found = [solve(*one) for one in problems]
+        us = 1e6 * (time.perf_counter() - start) / len(found)
     columns = zip(*(x or (np.eye(3, 4), 1.0) for x in found), strict=True)
     pose, focal = (torch.from_numpy(np.array(x, dtype=np.float64)) for x in columns)
     return Found(Pose(pose[..., :3], pose[..., 3]), focal, torch.tensor([x is not None for x in found]), us)
@@ -175,14 +175,12 @@ def row(found: Found, problems: Problems, *, focal: float = 0.05) -> dict[str, A
     return {**rates, "us": found.us or None, **medians}
 
 
-def rows_of_all(problems: Problems, some: int) -> list[dict[str, Any]]:
-    """Rows of our solvers, of pycolmap on the first ``some`` problems, of OpenCV on fewer, and of the oracle."""
-    found = {name: row(ours(create_solver(name, focal="unknown"), problems), problems) for name in OURS}
-    for (name, peer), count in zip(FOCAL_PEERS.items(), (some, FEW // 2), strict=True):
-        few = take(problems, slice(count))
-        found[name] = row(peer(few), few)
-    found["oracle"] = row(oracle(problems), problems)
-    return [{"solver": name, **measured} for name, measured in found.items()]
+def rows_of_all(problems: Problems) -> list[dict[str, Any]]:
+    """Rows of our solvers, of the other libraries, and of the oracle."""
+    found = {name: ours(create_solver(name, focal="unknown"), problems) for name in OURS}
+    found |= {name: peer(problems) for name, peer in FOCAL_PEERS.items()}
+    found["oracle"] = oracle(problems)
+    return [{"solver": name, **row(one, problems)} for name, one in found.items()]
 
 
 def measure_focal(count: int, sizes: Sequence[int] = SIZES, shares: Sequence[float] = SHARES) -> list[dict[str, Any]]:
@@ -190,7 +188,7 @@ def measure_focal(count: int, sizes: Sequence[int] = SIZES, shares: Sequence[flo
     rows = []
     for k, (n, outliers) in enumerate(itertools.product(sizes, shares)):
         harness.say(f"unknown focal length, n = {n}, {outliers:.0%} outliers")
-        measured = rows_of_all(random_cameras(n, count, SEED + k, outliers), FEW if outliers > 0.25 else count)
+        measured = rows_of_all(random_cameras(n, count, SEED + k, outliers))
         rows += [{"n": n, "share": outliers, **found} for found in measured]
     return rows
 
@@ -238,7 +236,7 @@ def measure_scenes(data: Path, count: int) -> list[dict[str, Any]]:
         options: dict[str, Any] = {"n": SCENE_N, "batch_size": count, "seed": SEED + 300 + k, "num_spares": SCENE_N}
         problems = SceneProblems(load_scene(data / folder), **options, outliers=OutlierMix(count=outliers)).batch(0)
         place = {"scene": folder.split("/")[1], "outliers": outliers}
-        rows += [{**place, **found} for found in rows_of_all(problems, FEW)]
+        rows += [{**place, **found} for found in rows_of_all(problems)]
     return rows
 
 
@@ -251,14 +249,13 @@ def measure_rigs(count: int, sets: Sequence[tuple[int, float]] = RIG_SETS) -> li
         harness.say(f"rig of {cameras}, baseline {baseline}, n = {n}, {outliers:.0%} outliers")
         shape: dict[str, Any] = {"cameras": cameras, "baseline": baseline, "field_of_view": (50.0, 90.0)}
         problems = random_cameras(n, count, SEED + 200 + k, outliers, **shape)
-        found = {name: (ours(solver, problems, known=True), problems) for name, solver in solvers.items()}
-        few = take(problems, slice(FEW))
-        assert few.cam_from_rig is not None
-        rig = few.cam_from_rig.matrix[:, :cameras, :3]
-        given = *few[:2], few.intrinsics[:, :cameras], rig
-        found |= {name: (one_by_one(estimate, *given), few) for name, estimate in RIG_PEERS.items()}
+        found = {name: ours(solver, problems, known=True) for name, solver in solvers.items()}
+        assert problems.cam_from_rig is not None
+        rig = problems.cam_from_rig.matrix[:, :cameras, :3]
+        given = *problems[:2], problems.intrinsics[:, :cameras], rig
+        found |= {name: one_by_one(estimate, *given) for name, estimate in RIG_PEERS.items()}
         place = {"cameras": cameras, "baseline": baseline, "n": n, "share": outliers}
-        rows += [{**place, "solver": name, **row(*one, focal=math.inf)} for name, one in found.items()]
+        rows += [{**place, "solver": name, **row(one, problems, focal=math.inf)} for name, one in found.items()]
     return rows
 
 
@@ -282,12 +279,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and write the files."""
     command = harness.parser(__doc__)
     command.add_argument("--data", type=Path, help="the folder of the real scenes; without it they are not measured")
-    command.add_argument("--count", type=int, default=1000, help="number of problems in a batch")
+    command.add_argument("--count", type=int, default=400, help="number of problems in a row")
     options = command.parse_args(arguments)
 
     def measure() -> dict[str, Any]:
         data, count = options.data, options.count
-        found = {"focal": measure_focal(count), "cell": measure_cell(FEW), "real": [], "scenes": []}
+        found = {"focal": measure_focal(count), "cell": measure_cell(count), "real": [], "scenes": []}
         if data:
             found |= {"real": measure_real(data), "scenes": measure_scenes(data, count)}
         return {**found, "rigs": measure_rigs(count)}

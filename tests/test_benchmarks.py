@@ -225,7 +225,7 @@ def test_covariances_are_right_and_bring_errors_close_to_the_bound(monkeypatch):
 
 def test_cameras_are_measured_beside_the_peers(monkeypatch):
     script = load("cameras", *PEERS)
-    for name, value in (("RIGS", (3,)), ("BASELINES", (0.1,)), ("FEW", 8)):
+    for name, value in (("RIGS", (3,)), ("BASELINES", (0.1,))):
         monkeypatch.setattr(script, name, value)
     found = {row["solver"]: row for row in script.measure_focal(32, (12,), (0.25,))}
     assert set(found) == {*script.OURS, "pycolmap", "opencv, 21 focals", "oracle"}
