@@ -78,16 +78,20 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
     for name, tensor in state.items():
         if not tensor.isfinite().all():
             raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
-    # Refuse integers above the largest dimension of the saved tensors, before a module of such a size is built.
+    _check_sizes(folder / CONFIG_NAME, config, state)  # before a module of such a size is built
+    return config, state
+
+
+def _check_sizes(path: Path, config: Any, state: Mapping[str, Tensor]) -> None:
+    """Refuse integers above the largest dimension of the saved tensors."""
     largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
     entries = [("", config)]
     while entries:
         name, entry = entries.pop()
-        if isinstance(entry, dict):
+        if isinstance(entry, Mapping):
             entries += entry.items()
         elif isinstance(entry, int) and name not in _LENGTHS and entry > (len(state) if name == "layers" else largest):
-            raise ValueCheckError(f"{folder / CONFIG_NAME}: {name} is {entry}, too large for {WEIGHTS_NAME}.")
-    return config, state
+            raise ValueCheckError(f"{path}: {name} is {entry}, too large for {WEIGHTS_NAME}.")
 
 
 def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
@@ -183,12 +187,14 @@ class PretrainedMixin(nn.Module):
         """Write ``config.json`` and ``model.safetensors`` to a folder. A missing folder is created.
 
         Raises:
-            ValueCheckError: when :meth:`from_pretrained` cannot build the initialiser.
+            ValueCheckError: when :meth:`from_pretrained` would refuse the files.
         """
         config = self.config()
         if self.init is not None and config["init"]["name"] not in _INITIALISERS:
             raise ValueCheckError(f"{config['init']['name']} cannot be saved, only {sorted(_INITIALISERS)} can.")
-        write_weights(folder, config, self.state_dict())
+        state = self.state_dict()
+        _check_sizes(Path(folder) / CONFIG_NAME, config, state)
+        write_weights(folder, config, state)
 
     @classmethod
     def from_pretrained(cls, name_or_folder: str | Path) -> Self:

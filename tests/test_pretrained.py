@@ -15,12 +15,13 @@ from helpers import many, names_the_file, places_in, rate, spoiled
 from hypothesis import given
 from kornia.core.exceptions import ValueCheckError
 
-from kornia_pnpnet import PnPNet, create_solver, shipped_weights
+from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver, shipped_weights
 from kornia_pnpnet.core.files import digest, write_json
 from kornia_pnpnet.core.schema import to_json
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.metrics import reliability
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, read_weights, write_weights
+from kornia_pnpnet.propose.epnp import EPnP
 from kornia_pnpnet.training.card import write_model_card
 from kornia_pnpnet.training.results import find_results, load_run, summarize_runs
 
@@ -104,6 +105,12 @@ def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, 
     write_weights(tmp_path, config, {**state, "pair.bias": torch.full((4,), torch.nan)})
     with pytest.raises(ValueCheckError, match=r"not finite: pair\.bias"):
         PnPNet.from_pretrained(tmp_path)
+
+
+def test_a_solver_that_could_not_be_loaded_is_not_saved(tmp_path):
+    with pytest.raises(ValueCheckError, match=r"iterations is 1500, too large"):
+        PnPNet(EPnP(iterations=1500), RobustWeightedLM(5)).save_pretrained(tmp_path)
+    assert not any(tmp_path.iterdir())
 
 
 def test_digests_tell_contents_apart():
