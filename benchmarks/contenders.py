@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.utils.benchmark import timer
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, Starts, pose_errors, success, success_rate
+from kornia_pnpnet.core.files import digest
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
@@ -210,10 +211,12 @@ def coarse_pose(problems: Problems) -> Pose:
 
 
 def exported(spec: str, suffix: str, export: Callable[..., object]) -> Path:
-    """Export a solver for N pairs, unless ``outputs/exported`` has it from the present code: this takes minutes."""
-    path = HERE.parent / "outputs" / "exported" / f"{spec}-{source_digest()[:16]}{suffix}"
+    """Export a solver for N pairs in minutes, unless ``outputs/exported`` has it from the present code and weights."""
+    solver = load_solver(spec)
+    made_of = digest(source_digest(), torch.__version__, *solver.state_dict().values())
+    path = HERE.parent / "outputs" / "exported" / f"{spec}-{made_of[:16]}{suffix}"
     if not path.exists():
-        export(load_solver(spec), path, N)
+        export(solver, path, N)
     return path
 
 

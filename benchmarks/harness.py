@@ -97,10 +97,9 @@ def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
 
     Times are not to be trusted where the load average of the last minute is well above the number of threads.
     """
-    before = os.getloadavg()[0]
+    made, before = environment(), os.getloadavg()[0]  # the commit is that of the start
     found = measure()
-    load = [before, os.getloadavg()[0]]
-    return {"environment": environment(), "settings": settings, "load_average": load, **found}
+    return {"environment": made, "settings": settings, "load_average": [before, os.getloadavg()[0]], **found}
 
 
 def render(template: str, **facts: Any) -> str:

@@ -10,6 +10,10 @@
 set -eu
 cd "$(dirname "$0")/.."
 PYTHON=${PYTHON:-python}
+if ! git diff --quiet HEAD -- '*.py' conf; then
+    echo "Commit the changes of code first: results files name their commit."
+    exit 1
+fi
 PARTS=outputs/measured/$(git rev-parse HEAD)
 if [ ! -d "$PARTS" ]; then
     rm -rf outputs/measured outputs/results
@@ -31,7 +35,6 @@ for name in latency startup throughput; do
     part $name benchmarks/performance.py measure --parts $name
 done
 part uncertainty benchmarks/uncertainty.py --out benchmarks/uncertainty.json
-part cameras benchmarks/cameras.py --out benchmarks/cameras.json ${DATA:+--data "$DATA"}
 part upstream benchmarks/upstream.py --out benchmarks/upstream.json
 part scale benchmarks/scale.py --problems 10000000
 for name in fiducial_board incremental_map keypoint_offsets keypoint_pipeline localiser pose_network serve tracking; do
@@ -40,9 +43,10 @@ done
 part keypoint_covariances docs/examples/keypoint_pipeline.py --covariances --updates 600 --out docs/examples
 
 if [ -n "${DATA:-}" ]; then
+    part cameras benchmarks/cameras.py --out benchmarks/cameras.json --data "$DATA"
     part results docs/results/make.py measure --scenes "$DATA"
 else
-    echo "Not measured without DATA: the scenes, and the tables of docs/results"
+    echo "Not measured without DATA: cameras and scenes, and the tables of docs/results"
 fi
 
 if [ -n "${MATCHES:-}" ]; then

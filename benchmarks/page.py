@@ -44,7 +44,8 @@ def quickest(results: Row) -> list[dict[str, Any]]:
     for group in figures.grouped((row for row in rows if "work" in row), "contender", "n", "mode").values():
         best = min(group, key=lambda row: row["median_us"])
         us = {row["batch"]: row["median_us"] for row in group}
-        found.append({**best, "us": us, "loop_us": loops[best["n"]]})
+        success = next((row["success"] for row in group if "success" in row), None)  # of the first batch
+        found.append({**best, "us": us, "loop_us": loops[best["n"]], "success": success})
     return found
 
 
@@ -77,6 +78,8 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         peers=[name for name in PEERS if name in alone],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         gpu=gpu,
+        gpu_compiles=bool(gpu)
+        and any("median_us" in row["modes"].get("compiled", {}) for row in gpu["graphs"]["rows"]),
         quickest=quickest(gpu) if gpu else [],
     )
 

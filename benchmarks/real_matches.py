@@ -71,9 +71,8 @@ EPIPOLAR_PX, TRIANGULATION_PX, MIN_ANGLE = 2.0, 2.0, 1.5
 # An image of the map can be matched to a query when this fraction of its points, and at least this number of them, lies
 # inside the query.
 MIN_OVERLAP, MIN_POINTS = 0.25, 30
-# Ends of the names of solvers that get 1 - ratio as the confidence of each pair, or KNOWN_SIGMAS.
-CONFIDENCE, SIGMAS = "+ratio", "+sigma"
-KNOWN_SIGMAS = {"img_sigma": 1.0, "world_sigma": 0.0}
+# End of the names of solvers that get 1 - ratio as the confidence of each pair.
+CONFIDENCE = "+ratio"
 # Limits of the numbers of pairs by which results are grouped.
 PAIRS = (0, 25, 50, 100, 200, 400, 501)
 PICTURES = 3
@@ -324,9 +323,10 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
 def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
     """Solve a batch; the result, and milliseconds of the processor for a problem.
 
-    A bound sees the reference poses. Other libraries with a ratio get the best pairs first.
+    A bound sees the reference poses. Other libraries with a ratio get the best pairs first, and only their own calls
+    are timed.
     """
-    known: dict[str, Any] = KNOWN_SIGMAS if SIGMAS in spec else {}
+    known: dict[str, Any] = {}
     if CONFIDENCE in spec and isinstance(solver, PeerSolver):
         order = ratio.argsort(dim=1, stable=True)
         world, img = (x.take_along_dim(order[..., None], 1) for x in given[:2])
@@ -336,7 +336,8 @@ def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -
     start = time.process_time()
     bound = isinstance(solver, SeesTruth)
     result = solver.solve_with_truth(given) if bound else solver(*given[:3], mask=mask, **known)
-    return result, 1e3 * (time.process_time() - start) / len(mask)
+    seconds = solver.library_s if isinstance(solver, PeerSolver) else time.process_time() - start
+    return result, 1e3 * seconds / len(mask)
 
 
 @torch.no_grad()
@@ -381,7 +382,7 @@ def groups(matches: Matches) -> dict[tuple[str, str], Tensor]:
 
 
 def load_solvers(specs: Sequence[str]) -> dict[str, nn.Module]:
-    """Solvers and bounds as for :func:`load_solver`, in float32, with CONFIDENCE or SIGMAS at the end."""
+    """Solvers and bounds as for :func:`load_solver`, in float32, with CONFIDENCE at the end."""
     return {spec: load_solver(spec.partition("+")[0]).float() for spec in specs}
 
 
@@ -425,6 +426,7 @@ def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
             given, _ = batch(matches, at[torch.arange(COST_BATCH) % len(at)])
             for spec, solver in solvers.items():
                 say(f"{group}: {spec}")
+                call(solver, spec, *take(given, slice(2)))  # not timed: slower
                 rows.append({"solver": spec, "group": group, "ms_per_problem": call(solver, spec, *given)[1]})
     return {"rows": rows}
 
@@ -514,7 +516,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     timing = commands.add_parser("cost", help="time solvers on groups of problems")
     for one in (measuring, timing):
         one.add_argument("problems", type=Path, nargs="+", help="files of `make`")
-        one.add_argument("--solvers", nargs="+", required=True, help=f"names, with {CONFIDENCE} or {SIGMAS} at the end")
+        one.add_argument("--solvers", nargs="+", required=True, help=f"names, with {CONFIDENCE} at the end")
         one.add_argument("--out", type=Path, required=True, help="the results file (.json)")
     measuring.add_argument("--split", default="", help="whether the scenes were seen while choosing, in words")
     measuring.add_argument("--pictures", type=Path, help="folder for pictures of failures of the first solver")
@@ -528,7 +530,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settings |= {"shares": SHARES, "pairs": PAIRS, "batch": COST_BATCH}
     run: Callable[[], dict[str, Any]] = partial(measure_cost, matches, options.solvers)
     if options.command == "measure":
-        settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32", "told": KNOWN_SIGMAS}
+        settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32"}
         settings |= {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
         run = partial(measure, matches, options.solvers, options.pictures, options.batch)
     results = recorded(run, **settings)

@@ -25,6 +25,7 @@ from kornia_pnpnet.arrow import list_column
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.files import write_json
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.evaluation.results import source_digest
 
 EXAMPLE = HERE.parent / "docs" / "examples" / "ray_data.py"
 COMMAND = [sys.executable, "-c", "import sys; from kornia_pnpnet.cli import main; sys.exit(main())", "solve", "--batch"]
@@ -43,7 +44,8 @@ ROUNDING = 1e-3
 def draw(folder: Path, problems: int) -> None:
     """Write problems with an ``id`` to Parquet files, unless they are there."""
     done = folder / "done"
-    if done.exists() and done.read_text() == str(problems):
+    drawn_by = f"{problems} {source_digest()}"
+    if done.exists() and done.read_text() == drawn_by:
         return
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -53,7 +55,7 @@ def draw(folder: Path, problems: int) -> None:
         drawn = dict(zip(("world_points", "img_points", "intrinsics"), source.batch(i)[:3], strict=True))
         lists = {name: list_column(x.float().numpy()) for name, x in drawn.items()}
         parquet.write_table(pa.table({"id": np.arange(start, start + count), **lists}), folder / f"{i:05}.parquet")
-    done.write_text(str(problems))
+    done.write_text(drawn_by)
 
 
 def run(command: list[str], kill_at: tuple[Path, int, str] | None = None) -> dict[str, Any]:
@@ -163,9 +165,9 @@ def main() -> None:
     command = parser(__doc__, HERE / "scale.json")
     command.add_argument("--problems", type=int, default=1_000_000)
     options = command.parse_args()
-    found = measure(options.problems)
+    made, found = environment(), measure(options.problems)
     versions = {name: metadata.version(name) for name in ("ray", "pyarrow")}
-    write_json(options.out, {"environment": environment(), "versions": versions, **found})
+    write_json(options.out, {"environment": made, "versions": versions, **found})
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 from contenders import bare_call, random_cameras, relative_errors
-from harness import HERE, Row, parser, pivot, recorded, render, say, threads
+from harness import HERE, Row, parser, pivot, recorded, render, say, seconds, threads
 from kornia.geometry import solve_pnp_dlt
 from torch import Tensor
 
@@ -74,9 +74,9 @@ def _timed(solve: Solve, problems: Problems, call: int) -> tuple[Tensor, float]:
     inputs = [x.float() for x in problems[:3]]
     with threads(), torch.no_grad():
         solve(*(x[:call] for x in inputs))
-        found, s = _cpu_seconds(lambda: [solve(*part) for part in zip(*(x.split(call) for x in inputs), strict=True)])
-    found = torch.cat(found)
-    return found, 1e6 * s / len(found)
+        parts, found = [*zip(*(x.split(call) for x in inputs), strict=True)], []
+        us = 1e6 * seconds(lambda: found.extend(solve(*x) for x in parts), clock=time.process_time)
+    return torch.cat(found), us / len(inputs[0])
 
 
 def _opencv(problems: Problems) -> tuple[Tensor, float]:
@@ -84,13 +84,7 @@ def _opencv(problems: Problems) -> tuple[Tensor, float]:
     solver = OpenCVRansac(threshold=THRESHOLD)
     with threads():
         found = solver(*problems[:3]).matrix[:, :3]  # not timed
-        return found, 1e6 * _cpu_seconds(bare_call(solver, problems))[1] / len(found)
-
-
-def _cpu_seconds(call: Callable[[], Any]) -> tuple[Any, float]:
-    start = time.process_time()
-    found = call()
-    return found, time.process_time() - start
+        return found, 1e6 * seconds(bare_call(solver, problems), clock=time.process_time) / len(found)
 
 
 def measure_success(count: int, cells: Sequence[tuple[int, float]] = CELLS) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import math
 import sys
+import time
 from dataclasses import dataclass, field, fields
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -63,6 +64,8 @@ class PeerSolver(nn.Module):
     """
 
     threshold: float
+    #: Processor time, in seconds, of the library's calls in the last call of the layer.
+    library_s: float = field(default=math.nan, init=False, repr=False)
     #: Name of the module to import, and name of the library for error messages.
     source: ClassVar[tuple[str, str]]
 
@@ -131,8 +134,12 @@ class PeerSolver(nn.Module):
         eye = torch.eye(3, 4, dtype=world.dtype, device=world.device)
         poses = eye.repeat(2, len(world), 1, 1)  # final and initial poses
         inliers, ok = torch.zeros_like(used), torch.zeros_like(pinhole)
-        for i in (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist():
-            found = self.solve_one(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy())
+        sound = (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist()
+        arrays = [(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy()) for i in sound]
+        start = time.process_time()
+        answers = [self.solve_one(*one) for one in arrays]
+        self.library_s = time.process_time() - start
+        for i, found in zip(sound, answers, strict=True):
             if found is not None:
                 both = np.stack([np.column_stack(x) for x in (found[:2], found.init or found[:2])])
                 if np.isfinite(both).all():

@@ -16,7 +16,7 @@ than an hour on one core, and continues where it was stopped::
     python train.py -m experiment=recipe $SHORT
     python train.py -m experiment=net_loss_only,identity_start,shared,additive,uncentred $SHORT
     python train.py -m experiment=kernels $SHORT
-    python train.py -m experiment=sweep threads=1 hydra.sweep.dir=outputs/sweep resume=true
+    python train.py -m experiment=sweep compile=true threads=1 hydra.sweep.dir=outputs/sweep resume=true
     python train.py -m experiment=capacity validation_size=5000 hydra.sweep.dir=outputs/capacity resume=true
 
 The trainings of ``distribution.json`` take minutes::

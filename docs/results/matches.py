@@ -20,7 +20,6 @@ BATCH = 500  # problems in a call of ours
 SCORES = "scores"  # end of the title of a solver that got a score for each pair
 WITH_SCORES = f"{ANY}+ratio"
 _TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known"}
-_KNOWN = {"": "", "ratio": SCORES, "sigma": "noise known"}
 
 
 def title(solver: str) -> str:
@@ -31,7 +30,7 @@ def title(solver: str) -> str:
     parts += ["fixed effort"] if "effort=fixed" in options else []
     parts += [f"{pixels} px" for pixels in re.findall(r"threshold=(\d+)", options)]
     parts += ["few samples"] if "max_iterations=10000," in f"{options}," else []
-    return ", ".join(filter(None, (*parts, _KNOWN[known])))
+    return ", ".join(filter(None, (*parts, SCORES if known else "")))
 
 
 class Total(NamedTuple):

@@ -28,6 +28,7 @@ BEGIN, END = "<!-- overview:begin -->", "<!-- overview:end -->"
 # Solvers and sets of ``benchmarks/solvers.json`` in the summary of synthetic problems.
 SUMMARY_SOLVERS = (ANY, OURS, "p3p-ransac", "poselib", "pycolmap", "opencv-ransac", "opencv-usac")
 SUMMARY_SETS = {"n = 9, 0 to 3 outliers": "0–3 of 9 outliers", "n = 100, 70 outliers": "70 of 100 outliers"}
+TIMED_SETS = ("n = 9, no outliers", "n = 9, 3 outliers")
 #: The set whose median errors the summary shows.
 ACCURACY_SET = "n = 200, 80 outliers, exact points"
 
@@ -45,6 +46,12 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, An
     chosen = [row for row in rows if row["set"] in sets and row["solver"].partition(":")[0] in SUMMARY_SOLVERS]
     found = grouped(chosen, "solver")
     return dict(sorted(found.items(), key=lambda x: (x[0] != ANY, -x[1][0]["success"]["rate"])))
+
+
+def times(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Microseconds without outliers and with 3 of 9, by the names of the solvers."""
+    named = [{**row, "name": row["solver"].partition(":")[0]} for row in rows if row["set"] in TIMED_SETS]
+    return {name: [f"{row['median_us']:.0f}" for row in own] for name, own in grouped(named, "name").items()}
 
 
 def page(overview: str) -> str:
@@ -72,6 +79,8 @@ def page(overview: str) -> str:
         benchmark=benchmark,
         unknown_focal=grouped(cameras["real"], "solver"),
         rigs=rigs,
+        rig_batch=cameras["settings"]["count"],
+        times=times(benchmark["rows"]),
         rig_ratios=[other["us"] / own["us"] for own, other in zip(rigs[ANY], rigs["PoseLib"], strict=True)],
         beside_robust=rates.compare_all((files["set"], files["set_real"]), ANY, ROBUST),
         beside_peers=rates.compare_all((files["set"], files["set_real"]), ANY, PEERS),

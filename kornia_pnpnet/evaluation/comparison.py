@@ -21,6 +21,7 @@ from kornia_pnpnet.core.trees import iter_tensors, map_tensors, take
 from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, row_errors, save_results, source_digest
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
+from kornia_pnpnet.peers import PeerSolver
 from kornia_pnpnet.result import PnPResult, Pose, Problems, gate_pose
 from kornia_pnpnet.solver import PnPNet
 
@@ -99,8 +100,9 @@ def evaluate(
         set whose shape a solver refuses).
 
         The row of a set and a solver has ``success`` (rate, low, high, total), ``rotation_error_deg`` and
-        ``translation_error`` (quartiles), ``ok`` (share), ``us_per_problem`` (median of the timed calls),
-        ``per_problem`` (errors and ok) and possibly ``environment`` (entries that differ from the file's entries).
+        ``translation_error`` (quartiles), ``ok`` (share), ``us_per_problem`` (median of the timed calls; for a peer the
+        processor time of the library alone), ``per_problem`` (errors and ok) and possibly ``environment`` (entries that
+        differ from the file's entries).
 
     Raises:
         ValueError: when ``path`` is not a results file, or holds another evaluation.
@@ -218,14 +220,14 @@ def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int)
 
 
 def _solve(solver: nn.Module, problems: Problems) -> tuple[PnPResult, float]:
-    """Solve the problems, and return the result and the elapsed seconds."""
+    """Solve the problems, and return the result and the seconds: elapsed, or those of a library's own calls."""
     device = problems.world_points.device
     start = _now(device)
     if isinstance(solver, SeesTruth):
         result = solver.solve_with_truth(problems)
     else:
         result = solver(*problems[:3], **(problems.known if isinstance(solver, PnPNet) else {}))
-    return result, _now(device) - start
+    return result, solver.library_s if isinstance(solver, PeerSolver) else _now(device) - start
 
 
 def _now(device: torch.device) -> float:
