@@ -78,8 +78,7 @@ def page(results: Rows, gpu: Row | None = None) -> str:
         peers=[name for name in PEERS if name in alone],
         sizes=[call["batch"] for call in sizes[0]] if sizes else [],
         gpu=gpu,
-        gpu_compiles=bool(gpu)
-        and any("median_us" in row["modes"].get("compiled", {}) for row in gpu["graphs"]["rows"]),
+        gpu_compiles=any("median_us" in x["modes"].get("compiled", {}) for x in (gpu["graphs"]["rows"] if gpu else ())),
         quickest=quickest(gpu) if gpu else [],
     )
 

@@ -74,7 +74,7 @@ def _timed(solve: Solve, problems: Problems, call: int) -> tuple[Tensor, float]:
     inputs = [x.float() for x in problems[:3]]
     with threads(), torch.no_grad():
         solve(*(x[:call] for x in inputs))
-        parts, found = [*zip(*(x.split(call) for x in inputs), strict=True)], []
+        parts, found = [*zip(*(x.split(call) for x in inputs), strict=True)], list[Tensor]()
         us = 1e6 * seconds(lambda: found.extend(solve(*x) for x in parts), clock=time.process_time)
     return torch.cat(found), us / len(inputs[0])
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from kornia_pnpnet.core.checks import check_form
 from kornia_pnpnet.core.extras import needs
+from kornia_pnpnet.core.files import REFUSED
 from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.registry import create_solver
 from kornia_pnpnet.result import Status
@@ -92,11 +93,14 @@ class Solve:
     def __call__(self, table: pa.Table) -> pa.Table:
         """Solve a table.
 
-        Missing columns and columns of equal names raise ``ValueCheckError``. Columns without numbers raise
+        Missing columns, columns of equal names, and the columns ``mask``, ``confidence`` and ``weight``, which would
+        have no effect, raise ``ValueCheckError``. Columns without numbers raise
         ``TypeCheckError``.
         """
         if double := {name for name in table.column_names if table.column_names.count(name) > 1}:
             raise ValueCheckError(f"the table has several columns {', '.join(sorted(double))}")
+        if refused := REFUSED & {*table.column_names}:
+            raise ValueCheckError(f"the column {min(refused)} is not read: pairs with 0 in weights are ignored")
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"the table has no column {name}")

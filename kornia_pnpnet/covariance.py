@@ -57,7 +57,7 @@ def pose_covariance(
     :math:`i` with respect to the tangent vector :math:`(\omega, v)` of :func:`~kornia_pnpnet.refine.residual.retract`.
     If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with the Cayley
     transform cay. :math:`\Sigma_i` is the covariance of the pixel, see
-    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. All steps run in float64. Gradients flow to all arguments.
+    :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. The sums run in float64. Gradients flow to all arguments.
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
     least squares on the inliers (P. Huber, "Robust Statistics", 1981). The weights are therefore divided by their mean
@@ -74,7 +74,8 @@ def pose_covariance(
         world_cov: see ``PnPNet.forward``.
         weights: weight of each pair, 0 for outliers, shape :math:`(B, N)`, such as ``result.inliers.double()``.
             ``None``: 1 for every pair.
-        prior: the prior of the solver's call. The prior's information is added to the information of the pairs.
+        prior: the prior of the solver's call. The prior's information, times the prior's robust weight at the pose, is
+            added to the information of the pairs.
         focal: ``"unknown"`` if the solver estimated the focal length, else ``"known"``. With ``"unknown"``, pass the
             ``intrinsics`` of the result, not the ``intrinsics`` of the solver's call.
         focal_sigma: the solver's ``focal_sigma``, a prior whose information is added to the information of the pairs.

@@ -141,7 +141,7 @@ def monte_carlo_pose_loss(
     size, inputs = checked[0]
     noise = inputs.noise
     assert noise is not None
-    sound = noise.img.isfinite() & (noise.img > 0) & noise.world.isfinite()
+    sound = noise.img.isfinite() & (noise.img >= 0) & noise.world.isfinite()
     padding = torch.stack([x == 0 for x in (torch.ones_like(noise.img), *inputs[3:5]) if x is not None]).any(0)
     known = (sound | padding).all(1)
     img, world = (torch.where(known[:, None] & sound, x, 1.0) for x in noise[:2])

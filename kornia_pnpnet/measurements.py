@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from kornia.core.check import KORNIA_CHECK
-from kornia.core.exceptions import ValueCheckError
+from kornia.core.exceptions import TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.subpix import spatial_expectation2d, spatial_softmax2d
@@ -156,6 +156,8 @@ def depth_points(
         "img_cov": (img_cov, (*batch, count, 2, 2)),
     }
     check_shapes(shapes)
+    if depth_sigma is None:
+        raise TypeCheckError("depth_sigma must be a number or a tensor, got None.")
     tensors = {name: tensor for name, (tensor, _) in shapes.items()}
     sigmas = {"depth_sigma": depth_sigma, "img_sigma": img_sigma}
     tensors |= {name: x for name, x in sigmas.items() if isinstance(x, Tensor)}

@@ -134,12 +134,12 @@ class PeerSolver(nn.Module):
         eye = torch.eye(3, 4, dtype=world.dtype, device=world.device)
         poses = eye.repeat(2, len(world), 1, 1)  # final and initial poses
         inliers, ok = torch.zeros_like(used), torch.zeros_like(pinhole)
-        sound = (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist()
-        arrays = [(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy()) for i in sound]
+        rows = (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist()
+        arrays = [(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy()) for i in rows]
         start = time.process_time()
         answers = [self.solve_one(*one) for one in arrays]
         self.library_s = time.process_time() - start
-        for i, found in zip(sound, answers, strict=True):
+        for i, found in zip(rows, answers, strict=True):
             if found is not None:
                 both = np.stack([np.column_stack(x) for x in (found[:2], found.init or found[:2])])
                 if np.isfinite(both).all():

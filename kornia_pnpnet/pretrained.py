@@ -10,6 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
+import torch
 from kornia.core.exceptions import BaseError, ValueCheckError
 from torch import Tensor, nn
 
@@ -31,7 +32,8 @@ CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 _FINGERPRINT = "sha256"
 # Largest number of bytes that are read from a configuration file. Every valid file is smaller.
 _LARGEST_CONFIG = 2**20
-# Integers up to this value are accepted in every configuration, because tensors of these sizes take little memory.
+# Integers up to this value are accepted in every configuration, because tensors of these sizes take little memory. Only
+# `layers` has a lower limit.
 _SMALL = 1000
 # Options that are lengths or scales, but not sizes of tensors.
 _LENGTHS = ("f_const", "img_scale", "max_error", "robustness", "world_scale")
@@ -75,15 +77,15 @@ def read_weights(name_or_folder: str | Path) -> tuple[dict[str, Any], dict[str, 
         raise ValueCheckError(f"Cannot read the weights in {folder}: {error}") from error
     if _FINGERPRINT in metadata and metadata[_FINGERPRINT] != _fingerprint(config, state):
         raise ValueCheckError(f"The weights in {folder} are damaged: {CONFIG_NAME} and {WEIGHTS_NAME} do not match.")
-    for name, tensor in state.items():
-        if not tensor.isfinite().all():
-            raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
-    _check_sizes(folder / CONFIG_NAME, config, state)  # before a module of such a size is built
+    _check(folder, config, state)  # before a module of such a size is built
     return config, state
 
 
-def _check_sizes(path: Path, config: Any, state: Mapping[str, Tensor]) -> None:
-    """Refuse integers above the largest dimension of the saved tensors."""
+def _check(folder: Path, config: Any, state: Mapping[str, Tensor]) -> None:
+    """Refuse tensors that are not finite, and integers above the largest dimension of the tensors."""
+    for name, tensor in state.items():
+        if not tensor.isfinite().all():
+            raise ValueCheckError(f"The weights in {folder} are not finite: {name}.")
     largest = max([_SMALL, *(size for tensor in state.values() for size in tensor.shape)])
     entries = [("", config)]
     while entries:
@@ -91,7 +93,7 @@ def _check_sizes(path: Path, config: Any, state: Mapping[str, Tensor]) -> None:
         if isinstance(entry, Mapping):
             entries += entry.items()
         elif isinstance(entry, int) and name not in _LENGTHS and entry > (len(state) if name == "layers" else largest):
-            raise ValueCheckError(f"{path}: {name} is {entry}, too large for {WEIGHTS_NAME}.")
+            raise ValueCheckError(f"{folder / CONFIG_NAME}: {name} is {entry}, too large for {WEIGHTS_NAME}.")
 
 
 def _fingerprint(config: Any, state: Mapping[str, Tensor]) -> str:
@@ -160,7 +162,10 @@ class PretrainedMixin(nn.Module):
         """Copy the solver with another refinement or other options. The copy and the solver share unchanged modules."""
         copied = type(self)(self.init, refine or self.refine, self.normalize, **{**self.options, **options})
         copied._run, copied._whole = copy.copy(self._run), copy.copy(self._whole)
-        return copied.train(self.training)
+        copied.training = self.training  # `train` would also change the modules that both solvers share
+        if refine is not None:
+            refine.train(self.training)
+        return copied
 
     def config(self) -> dict[str, Any]:
         """The constructor arguments of all parts, and the options, as plain data."""
@@ -193,7 +198,7 @@ class PretrainedMixin(nn.Module):
         if self.init is not None and config["init"]["name"] not in _INITIALISERS:
             raise ValueCheckError(f"{config['init']['name']} cannot be saved, only {sorted(_INITIALISERS)} can.")
         state = self.state_dict()
-        _check_sizes(Path(folder) / CONFIG_NAME, config, state)
+        _check(Path(folder), config, state)
         write_weights(folder, config, state)
 
     @classmethod
@@ -214,9 +219,10 @@ class PretrainedMixin(nn.Module):
             ValueCheckError: when the files are damaged or belong to another model.
         """
         config, state = read_weights(name_or_folder)
-        model = cls.from_config(config).float()
+        with torch.random.fork_rng(devices=[]), torch.device("cpu"):  # random initial weights would draw numbers
+            model = cls.from_config(config).float()
         try:
             model.load_state_dict(state)
         except RuntimeError as error:
             raise ValueCheckError(f"The weights {name_or_folder} belong to another model: {error}") from error
-        return model.eval()
+        return model.to(torch.get_default_device()).eval()

@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
 from kornia_pnpnet.arguments import checked_inputs, given_cameras, in_parts, restore_leading
-from kornia_pnpnet.core.checks import check_positive, check_whole
+from kornia_pnpnet.core.checks import check_numbers, check_whole
 from kornia_pnpnet.core.linalg import bound_gradient, gate
 from kornia_pnpnet.core.performance import Runner, compiling, in_full_precision, in_turn, needs_graph, sees_values
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors, put
@@ -146,7 +146,7 @@ class PnPNet(PretrainedMixin):
         KORNIA_CHECK(effort in (None, "fixed", "adaptive"), f"effort must be 'fixed' or 'adaptive', got {effort!r}.")
         KORNIA_CHECK(focal in ("known", "unknown"), f"focal must be 'known' or 'unknown', got {focal!r}.")
         if focal_sigma is not None:
-            check_positive(focal_sigma=focal_sigma)
+            check_numbers(1e-6, focal_sigma=focal_sigma)
         check_whole(0, 2, radial=radial)
         fits = focal == "unknown" or (focal_sigma is None and not radial)
         KORNIA_CHECK(fits, "focal_sigma and radial are for focal='unknown'.")
@@ -218,8 +218,9 @@ class PnPNet(PretrainedMixin):
                 need not be calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior adds a
                 term to the cost, and thus affects the refinement and the choice of the best pose. Unless ``init`` is
-                given, the refinement also starts from the prior's pose. ``ok`` and ``probability`` depend on the pairs
-                alone. If neither call nor initialiser gives the noise, the noise of pixels is assumed to be one pixel.
+                given or the focal length is unknown, the refinement also starts from the prior's pose. ``ok`` and
+                ``probability`` depend on the pairs alone. If neither call nor initialiser gives the noise, the noise of
+                pixels is assumed to be one pixel.
             dist: 4, 5, 8, 12 or 14 distortion coefficients, as in Kornia and OpenCV, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
@@ -361,10 +362,10 @@ class PnPNet(PretrainedMixin):
     def _attempt(self, inputs: Inputs, call: _Call, *, nominal: bool = False) -> _Attempt:
         """Propose poses, refine them, and judge the best pose. ``nominal``: whether the focal length is nominal."""
         fixed = call.first_stage_only or self.effort == "fixed"
-        free = not fixed and sees_values(*iter_tensors(inputs))
+        free = not (fixed or self._whole.compiled) and sees_values(*iter_tensors(inputs))
         can_adapt = trait(self.init, "estimates_noise") and self.refine.m > 0
         adapts = free and (self.effort == "adaptive" or (can_adapt and not self.training))
-        compares = free and not self.training and not self._whole.compiled
+        compares = free and not self.training
         # Rigs are not searched, and an unknown focal length has another search.
         searches = adapts and self.focal == "known" and inputs.rig is None
         problem, frame, starts = self._run(self._propose, inputs, call, searches)
@@ -375,7 +376,8 @@ class PnPNet(PretrainedMixin):
         seen = problem
         if inputs.radial is not None:
             seen = distorted(problem, inputs.radial)
-            camera = torch.cat((torch.zeros_like(inputs.radial[:, :1]), inputs.radial), 1)
+            zoom = torch.zeros_like(inputs.radial[:, :1]) if starts.camera is None else starts.camera[:, :1]
+            camera = torch.cat((zoom, inputs.radial), 1)
             starts = starts._replace(camera=camera)
         plan = self._run(self.refine.begin, seen, starts)
         more = _MORE_ITERATIONS if (nominal or self.radial) and not call.first_stage_only else 0
@@ -415,7 +417,7 @@ class PnPNet(PretrainedMixin):
                 ignored = torch.zeros_like(frame.status) if frame.ignored is None else frame.ignored
                 frame = frame._replace(ignored=torch.where(usable, ignored, Status.INIT.value))
         views = 1 if call.first_stage_only or self.refine.m == 0 else self.views
-        fixed, order = self.effort == "fixed", self.normalize.order
+        fixed, order = self.effort == "fixed" or self._whole.compiled, self.normalize.order
         starts = propose(self.init, problem, given, views=views, order=order, fixed=fixed, search_follows=searches)
         return problem, frame, starts
 

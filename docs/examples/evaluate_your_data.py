@@ -51,7 +51,7 @@ def main() -> None:
             start = time.perf_counter()
             result = solver(**arrays)
             ms = 1e3 * (time.perf_counter() - start) / len(result.ok)
-        errors = pose_errors(result.pose, truth)
+        errors = pose_errors(result.pose, Pose(*(x.to(result.rotation) for x in truth)))
         solved, ok = (100 * x.double().mean() for x in (success(errors, *options.limits), result.ok))
         angle, shift = (x.median() for x in errors)
         print(f"{name:<12}  {solved:4.1f} %  {ok:4.1f} %  {angle:13.3f}°  {shift:17.4f}  {ms:14.2f}")

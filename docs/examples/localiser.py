@@ -1,10 +1,11 @@
 """Localise photos in a COLMAP model: ``python docs/examples/localiser.py --images FOLDER --model FOLDER``.
 
-Every fifth image of the model is a query whose observations are ignored, the others are the map. Kornia finds features
-in all images; a feature of the map that lies on an observation of the model gets its point. Each query is matched with
-the images of the map that look most like it. Scores of matches become confidences, which are fitted on matches between
-images of the map. ``pnpnet-set`` solves the queries in batches, from the likeliest pairs of each. COLMAP's estimator
-(pycolmap) gets the same pairs, those that pass the ratio test, and all matches, one query after the other.
+Every fifth image of the model is a query whose observations are ignored, the others are the map (if images of the model
+have no points, these are the queries). Kornia finds features in all images; a feature of the map that lies on an
+observation of the model gets its point. Each query is matched with the images of the map that look most like it. Scores
+of matches become confidences, which are fitted on matches between images of the map. ``pnpnet-set`` solves the queries
+in batches, from the likeliest pairs of each. COLMAP's estimator (pycolmap) gets the same pairs, those that pass the
+ratio test, and all matches, one query after the other.
 
 Without ``--images`` and ``--model`` a hall is rendered first (``rendered_hall.py``). ``--features disk`` takes Kornia's
 DISK and LightGlue, whose weights Kornia downloads unless they are in the cache of ``torch.hub``. Writes
@@ -114,7 +115,7 @@ DETECTORS = {"sift": Sift, "disk": DiskLightGlue}
 
 
 def read_image(path: Path) -> tuple[np.ndarray, float]:
-    """An image (H, W, 3), shrunk to at most this number of pixels, and the factor."""
+    """An image (H, W, 3), shrunk to a longer side of at most ``LONGEST`` pixels, and the factor."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if picture is None:
         raise SystemExit(f"no image {path}")
@@ -181,6 +182,8 @@ def fit_scores(references: Sequence[Photo], detector: Detector) -> IsotonicRegre
 
 def choose(matches: Matches, calibration: IsotonicRegression) -> Matches:
     """The likeliest pairs of a query, with confidences as their scores."""
+    if not len(matches.scores):
+        return matches
     confidence = torch.from_numpy(calibration.predict(matches.scores.numpy()))
     top = confidence.topk(min(MOST_PAIRS, len(confidence))).indices
     return Matches(*(x[top] for x in matches[:2]), confidence[top])
@@ -270,7 +273,8 @@ def run(
     for i, photo in enumerate(photos):
         outlier, of_all = (errors_px(x[i], photo) > INLIER_PX for x in (kept, matched))
         row: dict[str, Any] = {"image": photo.name, "matches": len(of_all), "pairs": len(outlier)}
-        row |= {"outliers": outlier.double().mean().item(), "outliers_of_all": of_all.double().mean().item()}
+        shares = {"outliers": outlier, "outliers_of_all": of_all}  # 0 without pairs
+        row |= {name: x.double().mean().nan_to_num().item() for name, x in shares.items()}
         rows.append(row | {name: of_queries[i] for name, of_queries in found.items()})
         drawn.append((kept[i], result.inliers[i, : len(outlier)], rows[-1]))
     ms = {stage: 1000.0 * (end - begin) / len(photos) for (_, begin), (stage, end) in pairwise(marks)}

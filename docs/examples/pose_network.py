@@ -63,7 +63,7 @@ def train(steps: int, seed: int) -> list[dict[str, Any]]:
     solver = create_solver("pnpnet-set", effort="fixed")
     test_images, test_poses = draw(steps, TEST)
     for step in range(steps + 1):
-        if step % (steps // 10) == 0:
+        if step % max(1, steps // 10) == 0:
             with torch.no_grad():
                 pixels, sigma = network(test_images)
                 found = solver(SHAPE.expand(TEST, -1, -1), pixels, CAMERA, img_sigma=sigma)

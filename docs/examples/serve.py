@@ -32,12 +32,13 @@ class Server:
         Thread(target=self._run, daemon=True).start()
 
     def __call__(self, world_points: Tensor, img_points: Tensor, intrinsics: Tensor) -> PnPResult:
-        """Wait for the result of one problem: (N, 3), (N, 2) and (3, 3)."""
+        """Wait for the result of one problem in float32: (N, 3), (N, 2) and (3, 3)."""
         future: Future[PnPResult] = Future()
         pairs = len(world_points)
         if (world_points.shape, img_points.shape, intrinsics.shape) != ((pairs, 3), (pairs, 2), (3, 3)):
             raise ValueError("expected shapes (N, 3), (N, 2) and (3, 3)")
-        self.waiting.put(((world_points, img_points, intrinsics), future))
+        inputs = (world_points, img_points, intrinsics)
+        self.waiting.put((tuple(x.to("cpu", torch.float32) for x in inputs), future))  # alike, for one batch
         return future.result()
 
     def _run(self) -> None:

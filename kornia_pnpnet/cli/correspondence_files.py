@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_pnpnet.core.files import InputError, read_csv, read_npz
+from kornia_pnpnet.core.files import REFUSED, InputError, read_csv, read_npz
 from kornia_pnpnet.problem import MIN_PAIRS
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
-# Names that are refused, because users would expect an effect: in CSV files, and in NPZ files.
-_REFUSED_COLUMNS, _REFUSED_ARRAYS = {"mask", "confidence", "weights"}, {"mask", "confidence", "weight"}
+# Names of columns and arrays that are refused unless they are read, because users would expect an effect.
+_REFUSED = {*REFUSED, "weights", "img_sigma", "world_sigma", "dist"}
 
 
 class ImageCorrespondences(NamedTuple):
@@ -30,7 +30,10 @@ class ImageCorrespondences(NamedTuple):
     intrinsics: Tensor | None = None  # (3, 3)
 
     def undistorted(self, camera: str) -> ImageCorrespondences:
-        """Undistort pixels with ``kornia_pnpnet.data.colmap.undistort``. A pixel without a solution gets weight 0."""
+        """Undistort pixels with ``kornia_pnpnet.data.colmap.undistort``.
+
+        A pixel without a solution is NaN and gets weight 0.
+        """
         from kornia_pnpnet.data.colmap import undistort
 
         try:
@@ -39,7 +42,6 @@ class ImageCorrespondences(NamedTuple):
             raise InputError("--camera", str(error)) from None
         there = pixels.isfinite().all(-1)
         weights = torch.where(there, self.weights, 0.0).double()
-        pixels = torch.where(there[:, None], pixels, matrix[:2, 2])
         return ImageCorrespondences(self.world_points.double(), pixels, weights, _pinhole(matrix, "--camera"))
 
 
@@ -78,8 +80,8 @@ def read_correspondences(path: str | Path) -> ImageCorrespondences:
 def _read_csv(path: Path) -> ImageCorrespondences:
     rows: list[list[float]] = []
     for line, cells in read_csv(path, _COLUMNS, optional=("weight",)).items():
-        if refused := cells.keys() & _REFUSED_COLUMNS:
-            raise InputError(path, f"the column {min(refused)} is not read: use weight, with 0 for pairs to ignore")
+        if refused := cells.keys() & (_REFUSED - {"weight"}):
+            raise InputError(path, f"the column {min(refused)} is not read: pairs of weight 0 are ignored")
         rows.append([])
         for name in (*_COLUMNS, "weight"):
             text, value = cells.get(name, "1"), math.nan
@@ -119,11 +121,11 @@ def _read_npz(path: Path) -> ImageCorrespondences:
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read the named arrays of an NPZ file. Raise ``InputError`` if ``world_points`` or ``img_points`` is missing."""
     try:
-        arrays = read_npz(path, {*names, *_REFUSED_ARRAYS})
+        arrays = read_npz(path, {*names, *_REFUSED})
     except (OSError, ValueError) as error:
         raise InputError(path, getattr(error, "strerror", None) or str(error)) from None
-    if refused := arrays.keys() & _REFUSED_ARRAYS:
-        raise InputError(path, f"the array {min(refused)} is not read: use weights, with 0 for pairs to ignore")
+    if refused := arrays.keys() - {*names}:
+        raise InputError(path, f"the array {min(refused)} is not read: pairs with 0 in weights are ignored")
     for name in ("world_points", "img_points"):
         if name not in arrays:
             raise InputError(path, f"no array {name}")

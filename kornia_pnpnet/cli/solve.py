@@ -103,6 +103,7 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     from kornia_pnpnet.cameras import reproject
     from kornia_pnpnet.cli.correspondence_files import read_correspondences
     from kornia_pnpnet.core.files import InputError
+    from kornia_pnpnet.problem import MIN_PAIRS
 
     (path,), name, plot = arguments.file, arguments.solver, arguments.plot
     matches = read_correspondences(path)
@@ -119,7 +120,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     if arguments.diagnose and focal == "unknown":
         raise ValueError("--diagnose needs a known focal length")
     used = weights > 0
-    diagnosis = str(diagnose(world_points[used], img_points[used], camera)) if arguments.diagnose else None
+    enough = int(used.sum()) >= MIN_PAIRS
+    diagnosis = diagnose(world_points[used], img_points[used], camera) if arguments.diagnose and enough else None
     with torch.no_grad():
         result = solver(*pairs, camera[None], weights[None])
         uncertain = {"focal": focal, "focal_sigma": getattr(solver, "focal_sigma", None)}
@@ -149,7 +151,7 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         "intrinsics": camera.tolist(),
         **({"dist": result.dist[0].tolist()} if result.dist.any() else {}),
         **({"focal_sigma_px": _finite(deviations[6:] * camera[0, 0].abs())[0]} if focal == "unknown" else {}),
-        **({"diagnosis": diagnosis} if diagnosis else {}),
+        **({"diagnosis": str(diagnosis)} if diagnosis else {}),
         "cost": result.cost.item(),
         "rejected_above_px": limit,
         "pairs": [

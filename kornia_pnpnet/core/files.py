@@ -20,6 +20,9 @@ from torch import Tensor
 #: Largest total size in bytes that :func:`read_npz` reads. A compressed file of a few megabytes can contain gigabytes.
 MOST_BYTES = 2**31
 
+#: Names of fields of pairs that no file of problems may have, because they would have no effect.
+REFUSED = {"mask", "confidence", "weight"}
+
 
 class InputError(ValueError):
     """An input file or a command-line option cannot be used. The message is one line that begins with ``source``."""

@@ -101,7 +101,7 @@ def are_semi_definite(matrix: Symmetric2 | Symmetric3) -> Tensor:
     rows = [[x * scale for x in row] for row in rows]
     for row in rows:
         row[-1] = row[-1] + _ROUNDING * limits.eps
-    good = trace < limits.max**0.25  # products of larger entries could overflow
+    good = (trace >= 0) & (trace < limits.max**0.25)  # products of larger entries could overflow
 
     def inverse(k: int, pivot: Tensor) -> Tensor:
         nonlocal good

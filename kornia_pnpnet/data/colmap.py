@@ -160,8 +160,10 @@ def _match_views(path: Path, max_error_px: float) -> Iterator[View]:
     names = [str(name) for name in np.atleast_1d(arrays["names"])]
     count = len(names)
     intrinsics, rotation = (_numbers(arrays, key, count, 3, 3) for key in ("K", "R"))
-    translation, sizes = _numbers(arrays, "t", count, 3), _numbers(arrays, "size", count, 2).tolist()
-    for i, (width, height) in enumerate(sizes):
+    translation, sizes = _numbers(arrays, "t", count, 3), _numbers(arrays, "size", count, 2)
+    if not ((sizes > 0) & sizes.isfinite()).all():
+        raise ValueError("'size' has numbers that are not positive")
+    for i, (width, height) in enumerate(sizes.tolist()):
         img = _numbers(arrays, f"{i:03d}_img_points", None, 2)
         world = _numbers(arrays, f"{i:03d}_world_points", len(img), 3)
         inliers = _numbers(arrays, f"{i:03d}_error_px", len(img)) <= max_error_px

@@ -333,7 +333,7 @@ class CameraProblems(RandomProblems):
         check_numbers(0.0, 1.0, outlier_share=self.outlier_share)
         for name, low, high in (("field_of_view", 1e-3, 170.0), ("depth_spread", 0.0, 0.95)):
             values = getattr(self, name)
-            rising = len(values) == 2 and low <= values[0] <= values[1] <= high
+            rising = hasattr(values, "__len__") and len(values) == 2 and low <= values[0] <= values[1] <= high
             KORNIA_CHECK(rising, f"{name} must be two rising numbers in [{low:g}, {high:g}], got {values!r}.")
 
     def _draw(self, generator: torch.Generator) -> Problems:

@@ -186,14 +186,15 @@ def _describe_data(entry: EvaluationData) -> dict[str, Any]:
 @torch.no_grad()
 def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int) -> dict[str, Any]:
     """Solve a set and return its row without the names of the set and the solver."""
-    problems, was_training = entry.problems, solver.training
+    problems, modes = entry.problems, [(part, part.training) for part in solver.modules()]
     chunks = [take(problems, slice(i, i + chunk)) for i in range(0, len(problems.world_points), chunk)]
     solver.eval()
     try:
         _solve(solver, chunks[0])
         calls = [_solve(solver, chunks[i % len(chunks)]) for i in range(max(repeats, len(chunks)))]
     finally:
-        solver.train(was_training)
+        for part, mode in modes:
+            part.training = mode
     # The time of a smaller last chunk is left out, because the fixed cost of a call would raise the time per problem.
     full = len(chunks[0].world_points)
     seconds = statistics.median(elapsed / full for result, elapsed in calls if len(result.ok) == full)

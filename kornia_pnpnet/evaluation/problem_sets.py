@@ -100,8 +100,10 @@ def evaluation_sets(
         try:
             scene = None if source in PRIORS else load_scene(source, metric=metric)
             name = source if scene is None else scene.name
-            if any(key.startswith(f"{name}, ") for key in sets):
-                name = source  # an earlier scene has the same name
+            taken = {key.partition(", n = ")[0] for key in sets}
+            name = source if name in taken else name
+            if name in taken:
+                raise ValueCheckError("an earlier source has the same name: pass a longer path")
             # Raw matches already contain outliers, and the mix adds further outliers.
             added = "+" if scene is not None and source.endswith(".npz") else ""
             suffix = ", noise given" if known_noise and scene is None else ""

@@ -33,6 +33,7 @@ from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, State
 from kornia_pnpnet.refine.residual import Projection, information, normal_equations, project
+from kornia_pnpnet.refine.terms import RADIAL
 
 __all__ = [
     "FAR_TURN",
@@ -310,9 +311,12 @@ def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, 
     """
     scale = found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
-    plausible = (found.sigma < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
+    noise = found.sigma  # the unit is a radian at the focal length of the problem
+    if problem.free_focal is not None:
+        noise = noise * problem.focal / seen.projection.focal
+    plausible = (noise < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
     sigma = pose_sigma(seen.projection, problem, precision).detach()
-    usable = plausible & _leave_a_line(seen.projection, problem, found.inlier > 0.5, found.sigma)
+    usable = plausible & _leave_a_line(seen.projection, problem, found.inlier > 0.5, noise)
     offset, by_evidence = LAW
     chance = torch.sigmoid(offset + by_evidence * found.log_ratio.clamp(*LAW_RANGE)) * within_limits(sigma)
     chance = chance if odds is None else chance * torch.sigmoid(odds)
@@ -331,15 +335,16 @@ def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Sym
     of the focal length counts as a change of distance. ``precision`` is the inverse variance (or covariance) of each
     pixel in px^-2, (B, N), 0 for outliers. The result is infinite if the pixels do not determine the pose.
     """
-    precision = map_tensors(lambda x: problem.focal.square() * x, precision)
+    sq_focal = projection.focal.reshape(-1, 1).square()
+    precision = map_tensors(lambda x: sq_focal * x, precision)
     matrix = normal_equations(projection, problem, precision).matrix
     matrix = matrix.permute(2, 0, 1).double()
     variance = torch.zeros_like(matrix[:, 0, 0])
     for k in range(matrix.shape[-1] - 1, 5, -1):  # the camera is eliminated (Schur complement)
         cross, own = matrix[:, k : k + 1, :k], matrix[:, k, k]
+        if problem.free_focal is not None and problem.free_focal.information is not None:
+            own = own + (problem.free_focal.information if k == 6 else RADIAL**-2)
         if k == 6:
-            if problem.free_focal is not None and problem.free_focal.information is not None:
-                own = own + problem.free_focal.information
             # The depth of the points grows with the focal length, see `refine.residual.moved`.
             left = own - _form(matrix[:, :6, :6], cross[:, 0])
             variance = torch.where(left > 0, left.reciprocal(), torch.inf) / _FAR_SHIFT**2

@@ -11,7 +11,7 @@ from torch.nn import functional
 from kornia_pnpnet.cameras import focal_length, pinholes, with_undistorted
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.core.trees import map_tensors, put, take
-from kornia_pnpnet.frame import Normalize
+from kornia_pnpnet.frame import F_CONST, Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
@@ -126,7 +126,7 @@ def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, 
     if not len(rows):
         return state, doubted
     some = take(problem, rows)
-    found = _FURTHER(some._replace(img_scale=torch.ones_like(some.img_scale)))
+    found = _FURTHER(some._replace(img_scale=(some.focal / F_CONST).expand(len(rows))))
     usable = found.ok & found.camera.isfinite().all(1)
     state = put(state, rows[usable], take(State(found.pose, found.camera), usable))
     return state, doubted.index_put((rows,), usable)

@@ -8,8 +8,10 @@ from torch import nn
 
 from kornia_pnpnet.core.checks import check_whole
 from kornia_pnpnet.core.configured import Configured
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet.core.performance import ascending_order
+from kornia_pnpnet.core.trees import map_tensors, pairs_at
 from kornia_pnpnet.problem import Hypotheses, Problem
+from kornia_pnpnet.propose.initialiser import trait
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.result import gate_pose
 
@@ -59,6 +61,8 @@ class SubsetSolver(Configured):
     def hypotheses(self, problem: Problem) -> Hypotheses:
         """Find one pose per sample. A pose is valid if the pose is finite and the start is ``ok``."""
         problem = problem._replace(free_focal=None)  # the pose is scored with the focal length of the problem
+        if trait(self.init, "fixed_pairs"):  # such a network needs pairs that are sorted by their pixels
+            problem = pairs_at(problem, ascending_order(problem.img_points.permute(2, 1, 0)))
         starts = self.init(problem)
         pose = starts.pose if self.refine is None else self.refine(problem, starts).pose
         valid = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)

@@ -139,7 +139,7 @@ class RANSAC(Initialiser):
             ShapeError: when a problem has fewer pairs than a sample.
             NotImplementedError: inside of ``torch.func.vmap``, or on the device ``meta``.
         """
-        size = self.minimal.sample_size
+        size = self.minimal.sample_size if problem.rig is None else MIN_PAIRS
         if problem.weights.shape[1] < size:
             raise ShapeError(
                 f"Samples of {size} pairs need N >= {size}, got N = {problem.weights.shape[1]}.",
@@ -212,10 +212,10 @@ def search_on(
     the poses of the samples. Let :math:`w` be the weight of a pair in the starts. The chance of drawing this pair is
     proportional to :math:`0.8 + 0.2 w`. A large confidence of the caller increases the chance.
 
-    A pair is an inlier if its residual is below ten standard deviations. If the caller gave the noise of the pair, the
-    limit is five standard deviations. If the caller gave no noise, the standard deviation of every pair is the mean of
-    the estimates. The noise of points is converted to pixels at one depth: the depth of the world's origin in the first
-    pose. If each pose used its own depths, a pose close to the points would have the most inliers.
+    A pair is an inlier if its residual is below ten standard deviations. If the caller gave both sigmas of the pair,
+    the limit is five standard deviations. If the caller gave no noise, the standard deviation of every pair is the mean
+    of the estimates. The noise of points is converted to pixels at one depth: the depth of the world's origin in the
+    first pose. If each pose used its own depths, a pose close to the points would have the most inliers.
 
     Args:
         problem: normalised problems of a centred and scaled world.
@@ -237,7 +237,8 @@ def search_on(
     known, noise = problem.noise, constant.noise
     if noise is None:
         raise ValueCheckError('effort="adaptive" needs an initialiser that estimates the noise, like SetInit.')
-    problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
+    problem = problem._replace(noise=None, weights=relative(problem.weights, problem.weights))
+    problem = problem.map(lambda x: x.detach().contiguous())
     depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)
     if known is None:

@@ -187,7 +187,7 @@ def _random_numbers(size: int, most: int, seed: int) -> Tensor:
 @lru_cache(maxsize=256)
 def _subsets(count: int, size: int, seed: int) -> Tensor:
     """List all subsets (C, size) of ``size`` out of ``count`` items. The seed determines their random order."""
-    table = torch.combinations(torch.arange(max(count, size), device="cpu"), size)
+    table = torch.tensor([*itertools.combinations(range(max(count, size)), size)], device="cpu")
     return table[torch.from_numpy(np.random.default_rng(seed).permutation(len(table)))]
 
 

@@ -26,7 +26,7 @@ from kornia_pnpnet.result import Pose
 
 __all__ = ["SCORERS", "Scene", "Scorer", "as_entries", "as_pose"]
 
-#: A function that maps standardised squared residuals of any shape to losses of the pairs.
+#: A function that maps standardised squared residuals of any shape to losses of the pairs, at least 0.
 Scorer: TypeAlias = Callable[[Tensor], Tensor]
 
 # For a point behind the camera, the numerator of e grows by this number times |depth|, so that e exceeds MAX_ERROR.

@@ -254,7 +254,8 @@ class Search:
         parts = problems.split(max(1, kept_at_once(_SAMPLES_AT_ONCE, problems) // (stop - start)))
         losses, poses = map_tensors(lambda *x: torch.cat(x), *(self._round(x, start, stop) for x in parts))
         better = losses[:, 0] < self.loss[problems]
-        self._improve(problems[better], losses[better], poses[better])
+        if len(at := problems[better]):
+            self.loss[at], self.poses[at] = self._improved(at, losses[better], poses[better])
         # After the first round, the number of samples is also unknown where a given pose stayed the best.
         changed = better if start else self.loss[problems].isfinite()
         self._expect(problems[changed & (self.samples.totals[problems] > stop)])
@@ -342,11 +343,6 @@ class Search:
             losses, best = losses.min(1, keepdim=True)
             poses = poses.gather(2, best[:, None].expand(-1, 12, -1))
         return losses[:number, 0], poses[:number, :, 0]
-
-    def _improve(self, problems: Tensor, losses: Tensor, poses: Tensor) -> None:
-        """Improve poses (P, 12, K), and store the best pose of each problem."""
-        if len(problems):
-            self.loss[problems], self.poses[problems] = self._improved(problems, losses, poses)
 
 
 def least_squares(problem: Problem, projection: Projection, weights: Tensor, variance: Tensor | None = None) -> State:

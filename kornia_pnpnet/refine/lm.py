@@ -302,7 +302,8 @@ class RobustWeightedLM(Configured):
         switch = max(self.m - self.by_residual, explored) if self.by_residual else len(each)
         guided, now = plan.problem._replace(weights=plan.guided), Progress.of(plan.state)
         implicit = self.backward == "implicit" and len(each) > 0  # without iterations, the starts have the gradient
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not implicit):
+        recording = torch.is_grad_enabled()
+        with torch.set_grad_enabled(recording and not implicit):
             if plan.starts > 1:
                 several = repeat_problems(guided, plan.starts)
                 for one in each[:explored]:
@@ -312,10 +313,11 @@ class RobustWeightedLM(Configured):
             for one in each[explored:switch]:
                 now = run(self._iteration, guided, now, *one)
             if each[switch:]:
-                plan, now = run(self.shown, plan, now)
+                with torch.set_grad_enabled(recording):  # also with `implicit`, the noise has a gradient
+                    plan, now = run(self.shown, plan, now)
             for step, damping, _ in each[switch:]:
                 now = run(self.by_residuals, plan, now, plan.votes.known, step, damping)
-        if implicit and torch.is_grad_enabled():
+        if implicit and recording:
             now = now._replace(state=self._with_gradient(plan, now, each[-1][2]))
         return plan, now
 

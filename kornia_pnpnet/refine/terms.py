@@ -32,7 +32,7 @@ _LARGEST_RATIO = 100.0
 _SCALE = 3.0
 # Prior standard deviation of a coefficient of radial distortion. The prior keeps a coefficient close to 0 if the pairs
 # do not determine the coefficient.
-_RADIAL = 0.15
+RADIAL = 0.15
 # Largest number of matrices in one call of cuSOLVER. A call with a hundred thousand matrices fails.
 _MOST_MATRICES = 10_000
 
@@ -125,7 +125,7 @@ class CameraTerm(NamedTuple):
         offset = (self.focal / self.expected).log()
         residual = torch.cat((state.zoom + offset[:, None], state.radial), 1)
         eye = torch.eye(count, dtype=residual.dtype, device=residual.device).expand(batch, count, count)
-        known = torch.cat((self.information[:, None], torch.full_like(state.radial, _RADIAL**-2)), 1)
+        known = torch.cat((self.information[:, None], torch.full_like(state.radial, RADIAL**-2)), 1)
         return Linear(residual, functional.pad(eye, (6, 0)), eye * known[:, None], torch.ones_like(offset))
 
     def loss(self, state: State) -> Tensor:

@@ -107,7 +107,7 @@ class TrainSettings:
         check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
         check_positive(clip=self.clip, or_infinite=True)
         check_numbers(0.0, 1.0, final_lr=self.final_lr)
-        rises = len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1] < math.inf
+        rises = hasattr(self.ramp, "__len__") and len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1] < math.inf
         KORNIA_CHECK(rises, f"ramp must be two shares, the second not smaller, got {self.ramp}.")
 
     def lr_factor(self, update: int) -> float:
@@ -235,9 +235,9 @@ def fit(
             for group in optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
             terms = LossTerms(*(share * x for x in _compare(solver, loss, problems, ramp)))
-            # Training on several processes needs a gradient of every parameter. Before the ramp, the loss therefore
-            # gets a zero term with the parameters of the refinement.
-            unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad) if ramp == 0.0 else 0.0
+            # Training on several processes needs a gradient of every parameter. The loss therefore gets a zero term
+            # with the parameters of the refinement, which have no effect before the ramp.
+            unused = sum(p.sum() for p in model.refine.parameters() if p.requires_grad)
             clock.lap("forward")
             optimizer.zero_grad()
             fabric.backward(terms.total + 0.0 * unused)
@@ -332,8 +332,8 @@ def train_briefly(seconds: float, folder: str | Path, *, progress: bool = True) 
     for name in (CHECKPOINT_NAME, HISTORY_NAME):
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / "tensorboard", ignore_errors=True)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
+    with torch.device("cpu"), torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(0)
         model = PnPNet(MLPInit(9), RobustWeightedLM(5))
     data = SyntheticProblems(n=9, batch_size=250, seed=0, outliers=OutlierMix())
     validation = {

@@ -18,9 +18,16 @@
 torch::Tensor read_pairs(const std::string& path) {
   std::ifstream file(path);
   std::string line;
-  if (!std::getline(file, line)) throw std::runtime_error(path + ": cannot be read");
+  const auto next = [&] {
+    const bool found = static_cast<bool>(std::getline(file, line));
+    if (found && !line.empty() && line.back() == '\r') line.pop_back();
+    return found;
+  };
+  if (!next()) throw std::runtime_error(path + ": cannot be read");
+  if (line != "X,Y,Z,u,v") throw std::runtime_error(path + ": expected the header X,Y,Z,u,v");
   std::vector<float> numbers;
-  while (std::getline(file, line)) {
+  while (next()) {
+    if (line.empty()) continue;
     const char* rest = line.c_str();
     for (int column = 0; column < 5; ++column) {
       char* end = nullptr;
@@ -43,6 +50,7 @@ int main(int argc, char** argv) try {
   const auto sizes = solver.get_metadata();
   const std::string n = sizes.at("pnpnet_n"), batch = sizes.at("pnpnet_batch");
   if (n != "any" && n != std::to_string(pairs.size(0))) throw std::runtime_error("the package is for n = " + n);
+  if (n == "any" && pairs.size(0) < 4) throw std::runtime_error("at least 4 pairs are needed");
   if (batch != "any" && batch != "1") throw std::runtime_error("the package is for batches of " + batch);
 
   const torch::Tensor world_points = pairs.narrow(1, 0, 3).unsqueeze(0).contiguous();  // (1, N, 3)
