@@ -348,7 +348,7 @@ BAD: dict[str, tuple[str, Callable[[Call, int], None]]] = {
     "negative sigma": ("img_sigma", _put("img_sigma", 3, -1.0)),
     "infinite length": ("world_sigma", _put("world_sigma", ..., math.inf)),
     "indefinite pixel": ("img_cov", _put("img_cov", (1, [0, 1], [1, 0]), 1e4)),
-    "negative ellipsoid": ("world_cov", _put("world_cov", (1, [0, 1, 2], [0, 1, 2]), -1.0)),
+    "negative ellipsoid": ("world_cov", _put("world_cov", (1, [0, 1, 2], [0, 1, 2]), -1e-9)),
     **{f"nan {lens}": (lens, _put(lens, 0, math.nan)) for lens in LENSES},
     "nan rig": ("cam_from_rig", lambda call, i: call["cam_from_rig"].translation[i, 2, 0].fill_(math.nan)),
     "nan prior": ("prior", lambda call, i: call["prior"].pose.rotation[i, 0, 0].fill_(math.nan)),

@@ -159,7 +159,7 @@ def test_tables_that_are_not_of_problems(draw):
     wrong = [(table.drop_columns(name), ValueCheckError) for name in ("img_points", "intrinsics")]
     texts = pa.array(["x"] * 7), pa.array([["x"]] * 7)
     wrong += [(table.set_column(0, "world_points", column), TypeCheckError) for column in texts]
-    wrong += [(table.append_column(name, table[0]), ValueCheckError) for name in NAMES]
+    wrong += [(table.append_column(name, table[0]), ValueCheckError) for name in (*NAMES, "mask")]
     for changed, error in wrong:
         with pytest.raises(error):
             Solve("epnp-lm")(changed)

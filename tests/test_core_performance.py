@@ -96,6 +96,14 @@ def test_what_cannot_be_captured_runs_as_it_is_with_one_warning(whole, backend):
             assert_same(result, eager(*inputs), rtol=1e-9, atol=1e-9)
 
 
+def test_starts_of_a_solver_that_is_compiled_as_a_whole_are_of_fixed_effort(make_problems):
+    inputs = make_problems(40, 10, outliers=30)[:3]
+    expected = create_solver("pnpnet-set", effort="fixed")(*inputs)
+    solver = create_solver("pnpnet-set")
+    solver.compile(whole=True)
+    assert_same(solver.with_starts(*inputs)[0], expected)
+
+
 @pytest.mark.parametrize("when", ["compile", "call"])
 def test_without_a_compiler_it_runs_as_it_is(when, monkeypatch):
     failing = Mock(side_effect=RuntimeError("no compiler"))

@@ -181,6 +181,7 @@ class Bomb:
         ("R", 2.0 * np.eye(3)[None], "not a rotation matrix"),
         ("R", -np.eye(3)[None], "not a rotation matrix"),
         ("names", np.array([Bomb()], dtype=object), r"x.npz' cannot be used: not an NPZ file of numbers"),
+        ("size", np.array([[np.inf, 480]]), "'size' has numbers that are not positive"),
         ("names", None, "no array 'names'"),
         ("000_error_px", None, "no array '000_error_px'"),
     ],

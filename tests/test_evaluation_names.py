@@ -7,6 +7,7 @@ import torch
 from helpers import assert_same, finite, make_view, rate, reprojection_errors
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from kornia.core.exceptions import BaseError
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from laws import BAD, Case, make_bad, take
 
@@ -139,6 +140,8 @@ def test_scenes_are_the_protocols_and_of_one_name_are_named_by_their_paths(scene
     assert (arbitrary.max_translation, arbitrary.unit) == (0.005 * scene().median_depth, "")
     sets = draw("a/room", "b/room", "a/room")
     assert list(sets) == ["room, n = 9, 0 outliers", "b/room, n = 9, 0 outliers"]
+    with pytest.raises(BaseError, match="same name"):
+        draw("a/room", "room")
 
 
 @pytest.mark.parametrize("bound", BOUNDS.values())

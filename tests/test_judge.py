@@ -10,12 +10,13 @@ from doubtful import INTRINSICS, doubtful
 from kornia.core.exceptions import BaseError
 from kornia.geometry.linalg import transform_points
 
-from kornia_pnpnet import Pose, Status, create_solver, diagnose, p3p, pose_errors, success
+from kornia_pnpnet import PnPNet, Pose, Status, create_solver, diagnose, p3p, pose_errors, success
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.draws import random_poses
-from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, _leave_a_line, at_pose, evidence
+from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, _leave_a_line, at_pose, evidence, pose_sigma
 from kornia_pnpnet.problem import Noise, Problem, State
-from kornia_pnpnet.refine.residual import project
+from kornia_pnpnet.refine.residual import project, rotation_angle
+from kornia_pnpnet.refine.terms import CameraTerm
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
@@ -73,6 +74,20 @@ def test_a_far_point_does_not_make_a_line_a_solid(length, random_rotations, gene
     rod, solid = (_leave_a_line(project(State.of(pose), x), x, there, sigma) for x in problems)
     assert rod.double().mean() < 0.03
     assert solid.all()
+
+
+@pytest.mark.parametrize("information", [None, 5.0])
+def test_an_unknown_focal_length_has_any_nominal_value(information):
+    p = CameraProblems(n=12, batch_size=4, seed=0, dtype=torch.float64).batch(0)
+    zoom, one = torch.tensor([[-1.0], [0.0], [0.5], [1.2]]).double(), torch.ones(4).double()
+    pixels = (p.img_points - p.intrinsics[:, None, :2, 2]) / p.intrinsics[:, :1, :1]
+    term = CameraTerm(one, None if information is None else information * one, one, one)
+    sigmas = []
+    for now, factor in ((zoom, zoom.exp()), (0.0 * zoom, torch.ones_like(zoom))):
+        problem = Problem.of(p.world_points, pixels * factor[..., None], free_focal=term)
+        precision = torch.ones_like(problem.weights) / factor**2
+        sigmas.append(pose_sigma(project(State(p.pose, now), problem), problem, precision))
+    torch.testing.assert_close(*sigmas)
 
 
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm", "pnpnet-n20"])
@@ -288,13 +303,15 @@ def test_padding_bad_problems_and_gradients(generator):
     assert not result.alternatives.rotation.requires_grad
 
 
-def test_problems_whose_noise_was_underestimated_have_alternatives():
-    """Their second solution takes the place of the first one, and the other poses are found for every problem."""
-    p = SyntheticProblems(n=30, batch_size=20, seed=5, img_sigma=40.0, world_sigma=0.0).batch(0)
-    solver = create_solver("pnpnet-set")
-    expected, result = solver(*p[:3]), solver(*p[:3], alternatives=2)
-    assert result.matrix.equal(expected.matrix)
-    assert result.alternatives.valid.shape == (20, 2)
+def test_a_pose_that_its_mirror_image_has_beaten_is_a_rival_too(generator):
+    pairs = boards(generator, batch=64, sigma=1.0)[:3]
+    best = create_solver("pnpnet-set")(*pairs, alternatives=1)
+    refiner = PnPNet(None, create_solver("pnpnet-set").refine).eval()
+    mirrored = Pose(best.alternatives.rotation[:, 0], best.alternatives.translation[:, 0])
+    one, other = (refiner(*pairs, init=pose) for pose in (best.pose, mirrored))
+    same = best.alternatives.valid[:, 0] & (rotation_angle(one.rotation, other.rotation) < 0.02)
+    assert same.sum() > 40
+    assert (one.probability - other.probability)[same].abs().max() < 0.2
 
 
 # --- the diagnosis ----------------------------------------------------------------------------------------------------

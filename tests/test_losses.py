@@ -322,3 +322,6 @@ def test_the_likelihood_of_bad_problems_costs_nothing_and_changes_no_other():
     box = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)])[None]
     centre = Pose(torch.eye(3)[None], torch.zeros(1, 3))  # the camera stands at the centroid
     assert monte_carlo_pose_loss(centre, centre, box, box[..., :2], torch.eye(3), img_sigma=1.0).item() == 0.0
+    away = Pose(torch.eye(3)[None], torch.tensor([[0.0, 0.0, 5.0]]))
+    seen = box[..., :2] / (box[..., 2:] + 5.0)
+    assert monte_carlo_pose_loss(away, away, box, seen, torch.eye(3), img_sigma=0.0, world_sigma=0.1).abs().item() > 0.1

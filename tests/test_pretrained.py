@@ -110,7 +110,17 @@ def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, 
 def test_a_solver_that_could_not_be_loaded_is_not_saved(tmp_path):
     with pytest.raises(ValueCheckError, match=r"iterations is 1500, too large"):
         PnPNet(EPnP(iterations=1500), RobustWeightedLM(5)).save_pretrained(tmp_path)
+    solver = create_solver("pnpnet-n9")
+    solver.refine.step.raw.data.fill_(torch.nan)
+    with pytest.raises(ValueCheckError, match="not finite"):
+        solver.save_pretrained(tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_loading_draws_no_random_numbers():
+    state = torch.get_rng_state()
+    create_solver("pnpnet-set")
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_digests_tell_contents_apart():

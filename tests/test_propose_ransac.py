@@ -8,8 +8,8 @@ import torch
 from helpers import are_rotations, finite
 from torch.testing import assert_close
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, pose_errors
-from kornia_pnpnet.core.trees import map_tensors
+from kornia_pnpnet import MLPInit, Normalize, PnPNet, Pose, PosePrior, RobustWeightedLM, create_solver, pose_errors
+from kornia_pnpnet.core.trees import map_tensors, pairs_at
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.judge.inliers import Thresholds, judge
@@ -412,3 +412,19 @@ def test_only_doubtful_problems_are_searched(monkeypatch, make_problems):
         assert create_solver("pnpnet-set")(world, *rest, **given).ok.tolist() == [True, False, True, True]
     with pytest.raises(AttributeError, match="run"):
         create_solver("pnpnet-set")(*make_problems(40, 4, outliers=30)[:3])
+
+
+@pytest.mark.parametrize("weight", [1e-30, 1e-3, 1e30])
+def test_a_prior_beside_weights_of_any_unit_does_not_decide_a_search(weight, make_problems):
+    p = make_problems(60, 10, outliers=40)
+    wrong = PosePrior(make_problems(60, 10, seed=7).pose, torch.eye(6).expand(10, 6, 6))
+    ones, solver = torch.ones(10, 60).double(), create_solver("pnpnet-set")
+    one, other = (solver(*p[:3], x * ones, prior=wrong) for x in (1.0, weight))
+    assert one.ok.sum() > 5
+    assert_close(other.matrix, one.matrix)
+
+
+def test_a_sample_has_no_order(make_problems):
+    problem = Normalize(order=False)(*make_problems(7, 5)[:3])[0].map(torch.Tensor.contiguous)
+    solver, order = SubsetSolver(MLPInit(7).double(), size=7), torch.randperm(7)
+    assert_close(solver.hypotheses(pairs_at(problem, order.expand(5, 7))).pose, solver.hypotheses(problem).pose)

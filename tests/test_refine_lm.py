@@ -8,7 +8,7 @@ import torch
 from helpers import assert_same, reprojection_errors, verified_derivative
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 
-from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, pose_errors
+from kornia_pnpnet import Normalize, PnPNet, Pose, RobustWeightedLM, SetInit, create_solver, pose_errors
 from kornia_pnpnet.core.symmetric import symmetric
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.problem import Problem, State
@@ -169,6 +169,18 @@ def test_implicit_gradients_are_those_of_unrolling_to_the_minimum(kernel, make_p
     assert [x.any().item() for x in gradients[1]] == [True] * 4 + [False] * 4
     judged = PnPNet(SetInit(samples=0).double(), RobustWeightedLM(0, backward=backward), gradient="always")(*leaves[:3])
     assert torch.autograd.grad(judged.rotation.sum(), leaves[1])[0].any()  # the gradient of the start
+
+
+def test_implicit_gradients_of_the_noise_are_those_of_unrolling(make_problems):
+    p, gradients = make_problems(20, 6, outliers=4), []
+    init, sigma = create_solver("pnpnet-set").init.double(), (1.0 + torch.arange(120) % 3).double().view(6, 20)
+    for backward in ("unroll", "implicit"):
+        refine = RobustWeightedLM(30, by_residual=20, backward=backward).double()
+        solver = PnPNet(init, refine, gradient="always").eval()
+        result = solver(*p[:3], img_sigma=sigma.requires_grad_(), world_sigma=0.05)
+        gradients.append(torch.autograd.grad(result.translation[result.ok].sum(), sigma)[0])
+    assert result.ok.sum() > 3
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-5)
 
 
 def test_implicit_second_derivatives_are_those_of_unrolling_to_the_minimum(make_problems, perturb):

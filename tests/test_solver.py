@@ -264,6 +264,9 @@ def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, m
     assert_same(again(*p[:3]), solver(*p[:3]))
     solver.compile()
     assert solver.with_options()._run.compiled
+    solver.train().refine.eval()
+    solver.with_options(gradient="always")
+    assert (solver.training, solver.refine.training) == (True, False)
 
 
 #: What a random damage, of which ``test_interruptions.py`` tries many, does not do.
