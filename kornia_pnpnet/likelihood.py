@@ -71,7 +71,7 @@ def monte_carlo_pose_loss(
     distributions: one around the true pose, one around each hypothesis, and one around each of ``rounds`` modes. A mode
     is found by refining the sample with the largest importance weight so far. The precision of a t distribution is the
     matrix of the normal equations at its centre. Gradients flow to all inputs except poses. A problem that a solver
-    would refuse has the loss 0 and no gradient.
+    would refuse, or without the noise of a pixel, has the loss 0 and no gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
     4 to 7. This function adds hypotheses and a prior, and uses modes in place of fitted proposals.

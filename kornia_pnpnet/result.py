@@ -247,7 +247,7 @@ class Status(IntEnum):
     SOLVED = 0
     #: Fewer than 3 pairs have a positive weight.
     TOO_FEW_PAIRS = 1
-    #: The points lie on a line or coincide, or the pairs do not determine a pose.
+    #: The points lie on a line or coincide, or the refined pose is not finite.
     DEGENERATE = 2
     #: An input is invalid: a coordinate, weight or covariance that is not finite, a sigma whose fourth power is
     #: infinite, a negative weight or sigma, a covariance that is not positive semi-definite, an invalid prior, or a
@@ -277,7 +277,8 @@ class Alternatives(NamedTuple):
     Attributes:
         rotation: world-to-camera rotations by descending probability, shape :math:`(B, S, 3, 3)`.
         translation: world-to-camera translations, shape :math:`(B, S, 3)`.
-        cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. Costs of one problem are comparable.
+        cost: cost of each pose, see :class:`PnPResult`, shape :math:`(B, S)`. Costs of one problem are
+            comparable. If the focal length is unknown, their pixels are those of the estimated focal length.
         probability: probability of each pose, given that the true pose is the result's pose or an alternative,
             shape :math:`(B, S)`.
         valid: which slots hold a pose, bool, shape :math:`(B, S)`. Empty slots come last.

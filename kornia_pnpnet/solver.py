@@ -99,9 +99,10 @@ class PnPNet(PretrainedMixin):
             its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in
             ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If no problem of the
-            first batches is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all valid problems, but the
-            gradients of a problem's loss with respect to normalised inputs are limited to a norm of 10. To train a
-            network from random weights, use :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
+            first batches with gradients of the inputs is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all
+            valid problems, but the gradients of a problem's loss with respect to normalised inputs are limited to a
+            norm of 10. To train a network from random weights, use
+            :func:`~kornia_pnpnet.likelihood.monte_carlo_pose_loss`.
         views: number of views of each problem, 1 to 8. The views are the problem itself and its rotated or mirrored
             copies. A network proposes a different pose for each view (see :mod:`kornia_pnpnet.propose.views`).
         focal: ``"unknown"``: the focal length is estimated with the pose and returned in the result's ``intrinsics``.

@@ -63,7 +63,7 @@ class MixedProblems:
         sizes = _split(batch_size, shares, round)
         parts = zip(sources, sizes, strict=True)
         self.sources = [source(batch_size=size, seed=seed, **options) for source, size in parts if size]
-        # Sources are interleaved, so that every slice of a batch has approximately the shares of the whole batch.
+        # Sources are interleaved, so that every range of a batch has approximately the shares of the whole batch.
         turns = [(turn + 0.5) / size for size in sizes for turn in range(size)]
         self._order = torch.tensor(sorted(range(batch_size), key=turns.__getitem__), device="cpu")
 
