@@ -82,12 +82,18 @@ class Frame(NamedTuple):
         """Put values :math:`(B, N)` of pairs back into the caller's order."""
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
-    def undo_starts(self, starts: Starts) -> Starts:
-        """Express starts in the caller's frame, order and units. The ``ok`` of the new starts is :attr:`valid`."""
+    def undo_starts(self, starts: Starts, focal: Tensor) -> Starts:
+        """Express starts of problems with a focal length in the caller's frame, order and units.
+
+        The ``ok`` of the new starts is :attr:`valid`.
+        """
         noise = starts.noise
         if noise is not None:
-            noise = Noise(noise.img / self.img_scale[:, None], noise.world * self.size[:, None])
-            noise = map_tensors(self.undo_pairs, noise)
+            img, world = map(self.undo_pairs, noise[:2])
+            img_scale = self.img_scale[:, None]
+            if self.intrinsics.ndim > 3:  # the cameras of a rig have their own scales
+                img_scale = focal / (self.intrinsics[..., 0, 0] * self.intrinsics[..., 1, 1]).abs().sqrt()
+            noise = Noise(img / img_scale, world * self.size[:, None])
         others = None if starts.others is None else self.undo(starts.others)
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
 

@@ -307,7 +307,8 @@ class PnPNet(PretrainedMixin):
             call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always")
             inputs, nominal = self._with_camera(inputs)
             attempt = self._attempt(inputs, call, nominal=nominal)
-            result, starts = restore_leading(size, (attempt.result, attempt.frame.undo_starts(attempt.starts)))
+            starts = attempt.frame.undo_starts(attempt.starts, attempt.problem.focal)
+            result, starts = restore_leading(size, (attempt.result, starts))
             if rig:
                 intrinsics = args[2] if len(args) > 2 else options["intrinsics"]
                 result = result._replace(intrinsics=given_cameras(intrinsics, size, result.translation))

@@ -97,20 +97,14 @@ def test_other_columns_pass_through_and_rows_keep_their_order(draw):
     np.testing.assert_allclose(numbers(backwards, "rotation")[::-1], numbers(found, "rotation"), atol=1e-5)
 
 
-BAD = {
-    "a missing list": ("world_points", None, "malformed"),
-    "an empty list": ("img_points", [], "malformed"),
-    "too few pixels": ("img_points", [1.0] * 17, "malformed"),
-    "too many points": ("world_points", [1.0] * 30, "malformed"),
-    "part of a point": ("world_points", [1.0] * 28, "malformed"),
-    "two pairs": ("world_points", [1.0] * 6, "malformed"),
-    "no camera": ("intrinsics", [0.0] * 9, "camera"),
-    "half a camera": ("intrinsics", [1.0] * 4, "malformed"),
-    "NaN": ("img_points", [float("nan")] * 18, "not_finite"),
-    "a missing number": ("world_points", [None, *[1.0] * 26], "not_finite"),
-    "one point": ("world_points", [1.0] * 27, "degenerate"),
-    "a missing point": ("world_points", [[1.0] * 3] * 5 + [None] + [[1.0] * 3] * 4, "malformed"),
-}
+BAD = {"a missing list": ("world_points", None, "malformed"), "an empty list": ("img_points", [], "malformed")}
+BAD |= {"too few pixels": ("img_points", [1.0] * 17, "malformed"), "no camera": ("intrinsics", [0.0] * 9, "camera")}
+COUNTS = {"two pairs": 6, "part of a point": 28, "too many points": 30}
+BAD |= {name: ("world_points", [1.0] * count, "malformed") for name, count in COUNTS.items()}
+BAD |= {"half a camera": ("intrinsics", [1.0] * 4, "malformed"), "NaN": ("img_points", [np.nan] * 18, "not_finite")}
+BAD |= {"a missing number": ("world_points", [None, *[1.0] * 26], "not_finite")}
+BAD |= {"a missing point": ("world_points", [[1.0] * 3] * 5 + [None] + [[1.0] * 3] * 4, "malformed")}
+BAD |= {"one point": ("world_points", [1.0] * 27, "degenerate")}
 
 
 @pytest.mark.parametrize("kind", BAD)

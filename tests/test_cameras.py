@@ -23,19 +23,18 @@ from kornia_pnpnet.propose.focal import scale_focal
 from kornia_pnpnet.refine.residual import retract
 
 #: Coefficients of Kornia and OpenCV; the models take the first 4, 5, 8, 12 or 14.
-DIST = torch.tensor(
-    [-0.2, 0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002, 0.001, -0.001, 0.002, 0.0005, 0.01, -0.02], dtype=torch.float64
-)
+DIST = -0.2, 0.05, 0.001, -0.002, 0.01, 0.05, 0.01, 0.002, 0.001, -0.001, 0.002, 0.0005, 0.01, -0.02
+DIST = torch.tensor(DIST, dtype=torch.float64)
 FISHEYE = torch.tensor([0.05, -0.01, 0.002, -0.0005], dtype=torch.float64)
 LENSES = {"dist": DIST[:5], "fisheye": FISHEYE}
+RIGS = [("pnpnet-set", 3, 0.25, {}), ("pnpnet-set", 6, 0.25, {"effort": "fixed"}), ("p3p-ransac", 6, 0.25, {})]
+RIGS += [("reppnp-lm", 3, 0.0, {})]
 CAMERA = torch.tensor([[400.0, 0.0, 320.0], [0.0, 420.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 @pytest.fixture
 def uniform(generator):
-    return lambda *shape, low=-1.0, high=1.0: (
-        low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
-    )
+    return lambda *x, low=-1.0, high=1.0: low + (high - low) * torch.rand(*x, generator=generator, dtype=DIST.dtype)
 
 
 def seen(uniform, batch, n):
@@ -225,21 +224,15 @@ def test_four_pairs_all_around(camera, name, options, uniform):
 
 
 @pytest.mark.parametrize("base", [0.02, 0.5])
-@pytest.mark.parametrize(
-    ("name", "cameras", "outlier_share", "options"),
-    [
-        ("pnpnet-set", 3, 0.25, {}),
-        ("pnpnet-set", 6, 0.25, {"effort": "fixed"}),
-        ("p3p-ransac", 6, 0.25, {}),
-        ("reppnp-lm", 3, 0.0, {}),
-    ],
-)
+@pytest.mark.parametrize(("name", "cameras", "outlier_share", "options"), RIGS)
 def test_rigs(name, cameras, outlier_share, options, base):
     p = rig(32, 24, cameras, base, outlier_share)
     result = create_solver(name, **options)(*p[:3], **p.known)
     assert right(result, p.pose, 0.05, 0.01).double().mean() > 0.95
     torch.testing.assert_close(result.intrinsics, p.intrinsics)
-    assert torch.equal(create_solver(name, **options).with_starts(*p[:3], **p.known)[0].intrinsics, p.intrinsics)
+    given = create_solver(name, **options).with_starts(*p[:3], **p.known, img_sigma=1.5, world_sigma=0.0)
+    assert torch.equal(given[0].intrinsics, p.intrinsics)
+    assert given[1].noise is None or (given[1].noise.img - 1.5).abs().max() < 1e-5
     there, cameras = torch.arange(24) < 20, p.intrinsics.clone()
     cameras[:, ~there] = 0.0
     padded = create_solver(name, **options)(*p[:2], cameras, mask=there.expand(32, -1), **p.known)

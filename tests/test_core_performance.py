@@ -38,7 +38,6 @@ def problems(count, n=9, dtype=torch.float64):
 
 
 def assert_compiled_is_eager(solver, compiled, batch, rtol=1e-6, atol=1e-6, gradients=False):
-
     def solve(net):
         inputs = [x.clone().requires_grad_(gradients) for x in batch[:3]]
         with torch.set_grad_enabled(gradients):

@@ -23,9 +23,19 @@ from kornia_pnpnet.data.colmap import undistort
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"needs the real data in {SHARED}")
 
+#: Folders, and the numbers of their views and observations.
+MODELS = [("strecha/fountain-P11", 11, 22_808), ("strecha/Herz-Jesus-P25", 25, 42_420)]
+MODELS += [("colmap/lund_door", 12, 72_829)]  # 73 327 less the points an image observes twice
+MODELS += [("colmap/sceaux_castle", 11, 36_964), ("eth3d/courtyard", 37, 137_260)]
 DISTORTION = -0.15
 COUNTS = {"left/a.jpg": 40, "left/b.jpg": 25, "right/c.jpg": 12, "right/few.jpg": 9, "right/none.jpg": 0}
 FILES = ("cameras.txt", "images.txt", "points3D.txt")
+#: Contents of files, and the error.
+UNUSABLE = [(dict.fromkeys(FILES, ""), "no images"), ({"points3D.txt": ""}, "observes the point")]
+UNUSABLE += [(dict.fromkeys((f"{x[:-3]}{end}" for x in FILES), "junk"), "pycolmap") for end in ("txt", "bin")]
+UNUSABLE += [({"cameras.txt": "1 EQUIRECTANGULAR 640 320 640 320\n"}, "cannot be used")]
+CAMERAS = ["SIMPLE_RADIAL,640,480,500,320,240,-0.1", "OPENCV 640 480 500 510 320 240 -0.1 0.01 0.001 0.002"]
+CAMERAS += ["OPENCV_FISHEYE,640,480,500,510,320,240,0.01,0.002,0,0"]
 
 
 def text(*numbers):
@@ -124,16 +134,7 @@ def test_missing_models(tmp_path, monkeypatch):
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (dict.fromkeys(FILES, ""), "no images"),
-        (dict.fromkeys(FILES, "junk"), "pycolmap"),
-        (dict.fromkeys(("cameras.bin", "images.bin", "points3D.bin"), "junk"), "pycolmap"),
-        ({"cameras.txt": "1 EQUIRECTANGULAR 640 320 640 320\n"}, "cannot be used"),
-        ({"points3D.txt": ""}, "observes the point"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), UNUSABLE)
 def test_models_that_cannot_be_used(tmp_path, pycolmap, changes, message):
     write_model(tmp_path)
     for file, content in changes.items():
@@ -178,12 +179,10 @@ class Bomb:
         ("000_img_points", np.zeros((20, 3)), r"'000_img_points' has shape \(20, 3\) .*\(any, 2\)"),
         ("000_world_points", np.full((20, 3), "x"), "'000_world_points' .*expected numbers"),
         ("t", np.full((1, 3), np.inf), "translation has values that are not finite"),
-        ("R", 2.0 * np.eye(3)[None], "not a rotation matrix"),
-        ("R", -np.eye(3)[None], "not a rotation matrix"),
+        *(("R", factor * np.eye(3)[None], "not a rotation matrix") for factor in (2.0, -1.0)),
         ("names", np.array([Bomb()], dtype=object), r"x.npz' cannot be used: not an NPZ file of numbers"),
         ("size", np.array([[np.inf, 480]]), "'size' has numbers that are not positive"),
-        ("names", None, "no array 'names'"),
-        ("000_error_px", None, "no array '000_error_px'"),
+        *((name, None, f"no array '{name}'") for name in ("names", "000_error_px")),
     ],
 )
 def test_wrong_array(tmp_path, key, value, message):
@@ -217,16 +216,7 @@ def test_damaged_scenes_are_an_error_of_ours(tmp_path, pycolmap):
 
 
 @needs_shared
-@pytest.mark.parametrize(
-    ("folder", "views", "observations"),
-    [
-        ("strecha/fountain-P11", 11, 22_808),
-        ("strecha/Herz-Jesus-P25", 25, 42_420),
-        ("colmap/lund_door", 12, 72_829),  # 73 327 less the points an image observes twice
-        ("colmap/sceaux_castle", 11, 36_964),
-        ("eth3d/courtyard", 37, 137_260),
-    ],
-)
+@pytest.mark.parametrize(("folder", "views", "observations"), MODELS)
 def test_real_models_reproject(pycolmap, folder, views, observations):
     scene = load_scene(SHARED / folder, metric=not folder.startswith("colmap"))
     assert (scene.name, len(scene.views), scene.skipped) == (Path(folder).name, views, ())
@@ -252,14 +242,7 @@ def test_real_matches(name, mismatches):
     assert_close(wrong, mismatches, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "camera",
-    [
-        "SIMPLE_RADIAL,640,480,500,320,240,-0.1",
-        "OPENCV 640 480 500 510 320 240 -0.1 0.01 0.001 0.002",
-        "OPENCV_FISHEYE,640,480,500,510,320,240,0.01,0.002,0,0",
-    ],
-)
+@pytest.mark.parametrize("camera", CAMERAS)
 def test_any_camera_is_undistorted(camera, pycolmap):
     pixels = torch.tensor([[320.0, 240.0], [400.0, 300.0], [20.0, 40.0]], dtype=torch.float64)
     matrix, found = undistort(camera, pixels)
@@ -276,9 +259,6 @@ def test_any_camera_is_undistorted(camera, pycolmap):
 def test_other_cameras_are_refused(camera):
     with pytest.raises(ValueError, match="MODEL,width,height"):
         undistort(camera, torch.zeros(2, 2))
-
-
-# --- random problems of a scene ---------------------------------------------------------------------------------------
 
 
 def test_the_world_is_moved_rigidly_to_the_protocols_prior():

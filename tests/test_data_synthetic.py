@@ -132,16 +132,11 @@ def test_an_image_without_a_size_holds_the_points():
 
 KINDS = {"structured_share": 0.5, "mirrored_share": 0.5, "near_share": 0.2, "crowd_share": 0.5}
 OPTIONS = {"sigma_spread": (0.1, 1.0), "degrees": (1.5, 9.0), "bunched_share": 0.5, "half_image": None}
+SOURCES = [partial(SyntheticProblems, outliers=OutlierMix(max_ratio=0.95, **KINDS), known_noise=1.0, **OPTIONS)]
+SOURCES += [partial(CameraProblems, cameras=2), partial(SceneProblems, make_scene(20, 30), outliers=OutlierMix())]
 
 
-@pytest.mark.parametrize(
-    "source",
-    [
-        partial(SyntheticProblems, outliers=OutlierMix(max_ratio=0.95, **KINDS), known_noise=1.0, **OPTIONS),
-        partial(CameraProblems, cameras=2),
-        partial(SceneProblems, make_scene(20, 30), outliers=OutlierMix()),
-    ],
-)
+@pytest.mark.parametrize("source", SOURCES)
 def test_a_batch_depends_on_seed_and_index_alone(source):
     make = partial(source, n=6, batch_size=5)
     state, first = torch.get_rng_state(), make(seed=3).batch(11)
@@ -211,9 +206,6 @@ def test_copies_are_whole_pairs_and_leave_eight_originals():
     for x in (problems.img_points, problems.img_sigma[..., None], problems.confidence[..., None]):
         assert (distances(x, x)[same_point] == 0).all()
     assert (same_point[:, :8, :8].sum(-1) == 1).all()
-
-
-# --- outliers: their number, their positions and the pixels of each kind --------------------------------------------
 
 
 def counts(mix, n=9):
@@ -327,15 +319,9 @@ def test_structured_outliers_agree_on_another_pose_of_the_points_or_of_mirrored_
     assert agree[1 - int(mirrored)] < 0.1
 
 
-# --- many cameras -----------------------------------------------------------------------------------------------------
-
-
-def draw_cameras(**options):
-    return CameraProblems(**{"n": 8, "batch_size": 4000, "seed": 3, "dtype": torch.float64, **options}).batch(0)
-
-
 def test_cameras_see_their_points_but_for_outliers_and_fields_of_view_are_uniform():
-    problems = draw_cameras(n=10, outlier_share=0.3, img_sigma=0.0, field_of_view=(30.0, 90.0))
+    options = {"outlier_share": 0.3, "img_sigma": 0.0, "field_of_view": (30.0, 90.0), "dtype": torch.float64}
+    problems = CameraProblems(n=10, batch_size=4000, seed=3, **options).batch(0)
     assert (problems.true_cam_points[..., 2] > 0).all()
     assert_uniform(2.0 * torch.atan(1000.0 / problems.intrinsics[:, 0, 0]).rad2deg(), 30.0, 90.0)
     assert (problems.inliers.sum(1) == 7).all()
@@ -346,7 +332,8 @@ def test_cameras_see_their_points_but_for_outliers_and_fields_of_view_are_unifor
 
 
 def test_rigs():
-    problems = draw_cameras(cameras=3, baseline=0.2, img_sigma=0.0, batch_size=50)
+    options = {"cameras": 3, "baseline": 0.2, "img_sigma": 0.0, "dtype": torch.float64}
+    problems = CameraProblems(n=8, batch_size=50, seed=3, **options).batch(0)
     rotation, translation = problems.cam_from_rig
     seen = (problems.intrinsics @ problems.true_cam_points[..., None])[..., 0]
     torch.testing.assert_close(seen[..., :2] / seen[..., 2:], problems.img_points)
@@ -355,8 +342,6 @@ def test_rigs():
     centres = -(rotation.mT @ translation[..., None])[..., 0].norm(dim=-1)
     assert (centres.amax(1) / centres.amin(1) - 1).abs().max() < 1e-9
 
-
-# --- priors of points in the camera's frame, and mixtures -------------------------------------------------------------
 
 VIEWS = [data.FacadePoints, data.RoomPoints, data.DrivePoints]
 #: Points at the depths 1, 2 and 3.

@@ -25,6 +25,11 @@ CLEAN = {"clean": EvaluationData(SyntheticProblems(batch_size=100, seed=5).batch
 SPOILT = SyntheticProblems(batch_size=100, seed=5, outliers=OutlierMix(count=2))
 SETS = {**CLEAN, "spoilt": EvaluationData(draw_problems(SPOILT, 60), max_translation=0.5, unit="")}
 SOLVER = PnPNet(None, RobustWeightedLM(m=10, learnable=False))
+#: Entries of a results file that make no sense.
+WRONG = [*(("rows.0.success.rate", x) for x in (1.5, math.nan)), *(("rows.0.success.total", x) for x in (0.5, 2**63))]
+WRONG += [*(("rows.0.us_per_problem", x) for x in ("1", 10**400)), ("rows.0.solver", "t"), ("data", [])]
+WRONG += [("rows.0.per_problem", {"rotation_error_deg": [], "translation_error": [0.0], "ok": [1]})]
+WRONG += [("rows.0.per_problem.ok", 1), ("data.clean.n", None)]
 
 
 @pytest.fixture(autouse=True)
@@ -143,16 +148,7 @@ def test_other_files_are_refused(tmp_path, content):
         load_results(path)
 
 
-@pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        *(("rows.0.success.rate", value) for value in (1.5, math.nan)),
-        *(("rows.0.success.total", value) for value in (0.5, 2**63)),
-        *(("rows.0.us_per_problem", value) for value in ("1", 10**400)),
-        *(("rows.0.solver", "t"), ("rows.0.per_problem.ok", 1), ("data.clean.n", None), ("data", [])),
-        ("rows.0.per_problem", {"rotation_error_deg": [], "translation_error": [0.0], "ok": [1]}),
-    ],
-)
+@pytest.mark.parametrize(("place", "value"), WRONG)
 def test_the_wrong_entry_of_a_file_is_named(evaluated, place, value, path):
     save_results(evaluated, path)
     results = load_results(path)
@@ -227,11 +223,9 @@ def other_versions(solvers, data, patch):
     [
         (lambda solvers, *_: solvers.update(lm=lm(m=4)), r"lm\.config\.refine\.m was 3 and is 4"),
         (lambda solvers, *_: solvers.update(lm=lm(seed=1)), r"lm\.weights was"),
-        (lambda solvers, *_: solvers.pop("fixed"), r"solvers\.fixed\."),
-        (lambda solvers, data, _: data.pop("clean"), r"data\.clean\."),
+        *((lambda x, *_: x.pop("fixed"), r"solvers\.fixed\."), (lambda _, x, __: x.pop("clean"), r"data\.clean\.")),
         (other(max_translation=0.1), r"clean\.max_translation was 0.2 and is 0.1"),
-        (other(lambda part: part.flip(0)), r"clean\.digest was"),
-        (other(as_double), r"clean\.dtype was"),
+        *((other(lambda part: part.flip(0)), r"clean\.digest was"), (other(as_double), r"clean\.dtype was")),
         (other_versions, r"torch was .* and is '0\.1'; code was"),
     ],
 )

@@ -176,8 +176,6 @@ def test_noise_whose_covariance_has_no_float32_determinant_harms_its_problem_onl
     assert torch.equal(found.matrix[::2], expected.matrix[::2])
 
 
-# --- other poses: the mirror image of a plane, the solutions of three pairs; none where there is one minimum ----------
-
 NAMES = ["pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac"]
 
 
@@ -313,8 +311,6 @@ def test_a_pose_that_its_mirror_image_has_beaten_is_a_rival_too(generator):
     assert same.sum() > 40
     assert (one.probability - other.probability)[same].abs().max() < 0.2
 
-
-# --- the diagnosis ----------------------------------------------------------------------------------------------------
 
 CENTRE = torch.tensor([330.0, 235.0])
 SIZE = torch.tensor([640.0, 480.0])

@@ -64,9 +64,8 @@ def test_both_precisions_see_the_same_problems(points, n, seed, outliers):
     assert_same(single, map_tensors(lambda x: x.float() if x.is_floating_point() else x, double))
 
 
-EVERY_KIND = data.OutlierMix(
-    max_ratio=0.5, mismatch_share=0.3, structured_share=0.5, near_share=0.2, crowd_share=0.3, point_crowd_share=0.5
-)
+KINDS = {"structured_share": 0.5, "near_share": 0.2, "crowd_share": 0.3, "point_crowd_share": 0.5}
+EVERY_KIND = data.OutlierMix(max_ratio=0.5, mismatch_share=0.3, **KINDS)
 SOURCES = [data.SyntheticProblems(n=9, batch_size=4, outliers=EVERY_KIND)]
 SOURCES += [data.CameraProblems(n=9, batch_size=4, cameras=3)]
 SOURCES += [data.VaryingSize(data.SyntheticProblems, n=[5, 9], batch_size=4)]

@@ -207,9 +207,6 @@ def test_losses_of_bad_problems_are_finite():
         finite(terms, torch.autograd.grad(terms.total, leaves, retain_graph=True, materialize_grads=True))
 
 
-# --- the likelihood ---------------------------------------------------------------------------------------------------
-
-
 def problems(n=30, batch=4, seed=5, **noise):
     return SyntheticProblems(n=n, batch_size=batch, seed=seed, dtype=DOUBLE, **noise).batch(0)
 

@@ -18,10 +18,6 @@ both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
 OPTIONS = [dict(zip(("order", "center", "scale"), x, strict=True)) for x in itertools.product((True, False), repeat=3)]
 
 
-def residuals(pose, problem):
-    return project(State.of(pose), problem).residual.permute(2, 1, 0)
-
-
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 @pytest.mark.parametrize("f_const", [1.0, F_CONST])
 @pytest.mark.parametrize(("fx", "fy", "cx", "cy"), [(800, 1200, 0, 0), (3000, 2000, 2016.5, -7.25), (1, 1, 0.5, 0.5)])
@@ -38,7 +34,8 @@ def test_poses_go_to_the_frame_of_the_points_and_back_for_any_camera(fx, fy, cx,
         pixels, expected = (x.gather(1, frame.order[..., None].expand(-1, -1, 2)) for x in (pixels, expected))
     pose = frame.apply(p.pose)
     torch.testing.assert_close(problem.img_points, pixels)
-    torch.testing.assert_close(residuals(pose, problem), expected, rtol=1e-9, atol=1e-10 * f_const)
+    found = project(State.of(pose), problem).residual.permute(2, 1, 0)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10 * f_const)
     for back in (frame.undo(pose), frame.apply(frame.undo(p.pose))):
         torch.testing.assert_close(back.matrix, p.pose.matrix, rtol=0, atol=1e-10)
     assert problem.focal == f_const
@@ -114,7 +111,7 @@ def test_mirrors_show_the_same_problems_and_are_undone(order, make_problems):
         points = seen.world_points.unflatten(0, (count, 7))
         assert torch.equal(points[0], problem.world_points)  # the problem itself; no two views are alike
         assert not any(torch.equal(points[i], points[j]) for i in range(count) for j in range(i))
-        assert residuals(stacked, seen).abs().max() < 1e-6
+        assert project(State.of(stacked), seen).residual.abs().max() < 1e-6
         if order:
             assert (seen.img_points[:, 1:, 0] >= seen.img_points[:, :-1, 0]).all()
         return Starts(stacked, seen.weights)

@@ -23,7 +23,14 @@ def test_the_cause_of_a_failed_import_is_named():
 
 
 ROBUST = tuple(name for name in PEERS if name not in OPENCV)
-FEW = {"min_iterations": 2, "max_iterations": 4}
+FEW, FOUR = {"min_iterations": 2, "max_iterations": 4}, {"max_iterations": 4}
+#: Options of which both are sound and have other results.
+PAIRS = [(name, *({"seed": x, **FEW} for x in (0, 1))) for name in ("poselib", "pycolmap")]
+PAIRS += [("kornia-rs", *({"seed": x, **FOUR} for x in (0, 1)))]
+PAIRS += [("kornia-rs", *({"method": x, **FOUR} for x in ("AP3P", "EPnP")))]
+PAIRS += [("poselib", *({"progressive_sampling": x, **FEW} for x in (False, True)))]
+PAIRS += [("pycolmap", {"loss_scale": 0.1}, {"loss_scale": 100.0})]
+PAIRS += [(name, {"threshold": 3.0}, {"threshold": 100.0}) for name in ROBUST]
 
 
 def make(name: str, **options) -> PeerSolver:
@@ -104,18 +111,7 @@ def test_too_few_pairs_and_a_skew_fail_without_an_error(make_problems):
     assert not OpenCVRansac()(*make_problems(n=3, batch=4)[:3]).ok.any()
 
 
-@pytest.mark.parametrize(
-    ("name", "one", "other"),
-    [
-        ("kornia-rs", {"seed": 0, "max_iterations": 4}, {"seed": 1, "max_iterations": 4}),
-        ("kornia-rs", {"method": "AP3P", "max_iterations": 4}, {"method": "EPnP", "max_iterations": 4}),
-        ("poselib", {"seed": 0, **FEW}, {"seed": 1, **FEW}),
-        ("poselib", {"progressive_sampling": False, **FEW}, {"progressive_sampling": True, **FEW}),
-        ("pycolmap", {"seed": 0, **FEW}, {"seed": 1, **FEW}),
-        ("pycolmap", {"loss_scale": 0.1}, {"loss_scale": 100.0}),
-        *((name, {"threshold": 3.0}, {"threshold": 100.0}) for name in ROBUST),
-    ],
-)
+@pytest.mark.parametrize(("name", "one", "other"), PAIRS)
 def test_options_reach_the_library(name, one, other, make_problems):
     problems = make_problems(n=40, batch=20, outliers=20)
     first, second = (make(name, **options)(*problems[:3]) for options in (one, other))

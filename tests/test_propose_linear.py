@@ -16,6 +16,9 @@ SOLVERS = {
     "EPPnP": lambda **options: create_solver("reppnp", reject_outliers=False, **options),
     "REPPnP": lambda **options: create_solver("reppnp", **options),
 }
+THIN = [(5, None, 1e-3, 1.0), (4, 0.0, 1e-3, 0.99), (4, None, 1e-3, 0.85)]
+THIN += [(9, thickness, 1.0, 0.98) for thickness in (1e-1, 1e-3, 1e-8)]
+MIX = OutlierMix()  # at most 3, 6 and 16 outliers
 
 
 def flattened(p, thickness=0.0):
@@ -40,13 +43,7 @@ def test_exact_pairs_give_the_exact_pose(name, n, planar, make_problems):
     assert pose_errors(Pose(*(x.double() for x in single.pose)), p.pose).rotation_error_deg.max() < 0.2
 
 
-@pytest.mark.parametrize(
-    ("n", "thickness", "limit", "share"),
-    [
-        *((5, None, 1e-3, 1.0), (4, 0.0, 1e-3, 0.99), (4, None, 1e-3, 0.85)),
-        *((9, thickness, 1.0, 0.98) for thickness in (1e-1, 1e-3, 1e-8)),
-    ],
-)
+@pytest.mark.parametrize(("n", "thickness", "limit", "share"), THIN)
 def test_few_pairs_and_nearly_planar_points_are_solved(n, thickness, limit, share, make_problems):
     """Below a threshold the thickness is dropped and acts as noise of that size."""
     p = make_problems(n, 500, noise=False)
@@ -96,9 +93,6 @@ def test_a_view_through_a_telephoto_lens(dtype, max_error_deg, thickness, random
     assert (errors.rotation_error_deg < max_error_deg).double().mean() > 0.95
 
 
-MIX = OutlierMix()  # at most 3, 6 and 16 outliers
-
-
 # Shares of success, about three standard deviations below those of 5000 problems.
 @pytest.mark.parametrize(("n", "mix", "floor"), [(9, None, 0.88), (9, MIX, 0.715), (20, MIX, 0.975), (50, MIX, 0.995)])
 def test_success_on_the_protocols_problems(n, mix, floor):
@@ -139,9 +133,6 @@ def test_a_plane_parallel_to_the_image_has_a_gradient(plane):
     torch.testing.assert_close((pixels.grad * pixels.detach()).sum().item(), -4.0, rtol=1e-5, atol=0)
 
 
-# --- algebra of small matrices ----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(params=[True, False], ids=["few", "many"])
 def few(request, monkeypatch):
     """Whether functions that have a form for few problems and one for many use the first one."""
@@ -150,12 +141,10 @@ def few(request, monkeypatch):
 
 EASY = [(1, 1, 1), (3, 2, 1), (3, 2, 0), (3, 2, -1), (1, 1e-3, 1e-6)]
 HARD = [(1, 1e-5, -1e-7), (1, 1e-10, 0)]
+CASES = [(torch.float32, x, 3e-6) for x in EASY] + [(torch.float64, x, 1e-14) for x in EASY + HARD]
 
 
-@pytest.mark.parametrize(
-    ("dtype", "values", "tolerance"),
-    [(torch.float32, values, 3e-6) for values in EASY] + [(torch.float64, values, 1e-14) for values in EASY + HARD],
-)
+@pytest.mark.parametrize(("dtype", "values", "tolerance"), CASES)
 @pytest.mark.usefixtures("few")
 def test_nearest_rotation_is_known_from_its_singular_vectors(dtype, values, tolerance, random_rotations):
     left, right = random_rotations(50), random_rotations(50, seed=1)

@@ -204,8 +204,6 @@ def test_numbers_that_make_no_sense_have_finite_solutions(dtype):
     finite(found)
 
 
-# --- RANSAC -----------------------------------------------------------------------------------------------------------
-
 #: Thresholds for the noise of the protocol: 1 px and 0.05 m.
 PROTOCOL = {"threshold": 6.0, "world_threshold": 0.3}
 

@@ -20,8 +20,6 @@ from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.pretrained import shipped_weights
 
-# --- effort -----------------------------------------------------------------------------------------------------------
-
 
 def hard_problems(count=30):
     options = {"points": SlabPoints(), "outliers": OutlierMix(count=180), "world_sigma": 0.01}
@@ -244,16 +242,13 @@ def saved_net():
     return solver
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [
-        saved_net,
-        lambda: PnPNet(None, RobustWeightedLM(m=2, step=np.float32(0.9)), gradient="always"),
-        lambda: create_solver("epnp-lm", m=2, focal="unknown", focal_sigma=np.float32(0.1), radial=1),
-        lambda: create_solver("pnpnet-set", effort="fixed", views=2),
-        type("Sub", (PnPNet,), {"__init__": lambda self, *a, **x: PnPNet.__init__(self, *a, **x)}),  # noqa: PLW0108
-    ],
-)
+SAVED = [saved_net, lambda: PnPNet(None, RobustWeightedLM(m=2, step=np.float32(0.9)), gradient="always")]
+SAVED += [lambda: create_solver("epnp-lm", m=2, focal="unknown", focal_sigma=np.float32(0.1), radial=1)]
+SAVED += [lambda: create_solver("pnpnet-set", effort="fixed", views=2)]
+SAVED += [type("Sub", (PnPNet,), {"__init__": lambda self, *a, **x: PnPNet.__init__(self, *a, **x)})]  # noqa: PLW0108
+
+
+@pytest.mark.parametrize("solver", SAVED)
 def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, make_problems):
     solver, p = solver().eval(), make_problems(6)
     solver.save_pretrained(tmp_path / "deep" / "folder")
@@ -301,28 +296,18 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: create_solver("pnpnet-nine"), r"pnpnet-nine.*identity-lm"),
-        (lambda: create_solver(["epnp"]), "epnp"),
-        (lambda: create_solver(None), "None"),
-        (lambda: create_solver("identity-lm", iterations=3), r"options: got .* 'iterations'\.$"),
-        (lambda: create_solver("p3p-ransac", iterations=3), r"options: got .* 'iterations'\.$"),
-        (lambda: create_solver("pnpnet-n9", iterations=3), r"options: got .* 'iterations'\.$"),
-        (lambda: create_solver("poselib", iterations=3), r"options: got .* 'iterations'\.$"),
-        (lambda: create_solver("pnpnet-n9", m=-1), "m must"),
-        (lambda: create_solver("epnp-lm", effort="adaptive"), "effort"),
-        (lambda: PnPNet.from_config({**saved_net().config(), "init": {"name": "MLPInit", "n": "six"}}), "six"),
-        (lambda: PnPNet.from_config({**saved_net().config(), "init": {"name": "Oracle"}}), "Oracle"),
-        (lambda: PnPNet.from_config({**saved_net().config(), "refine": None}), "refine"),
-        (lambda: PnPNet.from_config({**saved_net().config(), "refine": {"kernel": "tukey"}}), "tukey"),
-        (lambda: PnPNet.from_config({**saved_net().config(), "colour": "red"}), "colour"),
-    ],
-)
-def test_solvers_that_there_are_not_raise_an_error_that_names_what_is_wrong(make, message):
+NAMES = "identity-lm", "p3p-ransac", "pnpnet-n9", "poselib"
+WRONG = [("pnpnet-nine", {}, r"pnpnet-nine.*identity-lm"), (["epnp"], {}, "epnp"), (None, {}, "None")]
+WRONG += [("pnpnet-n9", {"m": -1}, "m must"), ("epnp-lm", {"effort": "adaptive"}, "effort")]
+WRONG += [(name, {"iterations": 3}, r"options: got .* 'iterations'\.$") for name in NAMES]
+CONFIGS = {"six": {"init": {"name": "MLPInit", "n": "six"}}, "Oracle": {"init": {"name": "Oracle"}}}
+CONFIGS |= {"refine": {"refine": None}, "tukey": {"refine": {"kernel": "tukey"}}, "colour": {"colour": "red"}}
+
+
+@pytest.mark.parametrize(("name", "options", "message"), [*WRONG, *(("config", CONFIGS[x], x) for x in CONFIGS)])
+def test_solvers_that_there_are_not_raise_an_error_that_names_what_is_wrong(name, options, message):
     with pytest.raises(BaseError, match=message):
-        make()
+        PnPNet.from_config({**saved_net().config(), **options}) if name == "config" else create_solver(name, **options)
 
 
 def _solve_each(solver, problems, places):
