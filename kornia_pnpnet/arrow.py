@@ -87,7 +87,8 @@ class Solve:
             intrinsics = intrinsics.float()
         if options and not isinstance(solver, str):
             raise ValueCheckError(f"Options are for the name of a solver, got a module and {sorted(options)}.")
-        self.solver = create_solver(solver, **options) if isinstance(solver, str) else solver
+        with torch.device("cpu"):  # tables are solved on the CPU, whatever the default device is
+            self.solver = create_solver(solver, **options) if isinstance(solver, str) else solver
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:

@@ -131,9 +131,11 @@ def export_program(
     """
     if trait(solver.init, "takes_given"):
         raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
-    if solver.focal == "unknown" and (solver.radial or not trait(solver.init, "estimates_noise")):
+    nominal = trait(solver.init, "estimates_noise") and solver.refine.by_residual
+    if solver.focal == "unknown" and (solver.radial or not nominal):
         raise ValueCheckError(
-            "With an unknown focal length, only a solver with SetInit and without radial distortion can be exported."
+            "With an unknown focal length, only a solver with SetInit, with iterations by residual and without radial"
+            " distortion can be exported."
             " Other solvers search for the focal length, and the number of samples depends on the data."
         )
     if rig and (solver.focal == "unknown" or solver.init is None):

@@ -313,12 +313,12 @@ class PnPResult(NamedTuple):
             :mod:`kornia_pnpnet.refine.kernels`), shape :math:`(B,)`. Costs of the same solver are comparable.
         ok: whether the pose can be trusted, bool, shape :math:`(B,)`. Where ``ok`` is false, the pose, weights,
             cost, ``intrinsics`` and ``dist`` are finite, but have a gradient only with ``gradient="always"``.
-        init: the first guess. Unless a search or RANSAC for rigs found it, the first guess of every valid problem has a
-            gradient. An initialiser can thus learn even if the refinement fails.
+        init: the first guess. With the fixed effort (also in training mode), the first guess of every valid problem has
+            a gradient, except in rigs. An initialiser can thus learn even if the refinement fails.
         status: the value of the problem's :class:`Status`, int8, shape :math:`(B,)`.
-        probability: estimated probability that the rotation error is at most 10 degrees, and the translation error at
-            most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. Solvers of other
-            libraries return 1 where ``ok``.
+        probability: estimated probability that the rotation error is at most 10 degrees, and the error of the camera's
+            centre at most 30 % of the distance between camera and points, shape :math:`(B,)`, without gradient. Solvers
+            of other libraries return 1 where ``ok``.
         alternatives: other poses that explain the pairs nearly as well; empty unless the call requested alternatives.
         intrinsics: camera matrices with a last entry of 1, shape :math:`(B, 3, 3)`. In a rig the shape may be
             :math:`(B, N, 3, 3)`. An unknown focal length is replaced by its estimate. The identity replaces an invalid

@@ -237,7 +237,7 @@ class PnPNet(PretrainedMixin):
 
         Returns:
             The :class:`~kornia_pnpnet.result.PnPResult`. Gradients flow through pose, intrinsics, dist, weights and
-            cost of problems that are ``ok``, and through the first guess of every valid problem (see ``init`` there). A
+            cost of problems that are ``ok``, and often through the first guess (see ``init`` there). A
             problem without a finite pose gets the identity as its pose, and the square root of the dtype's largest
             number as its cost.
 
@@ -364,7 +364,8 @@ class PnPNet(PretrainedMixin):
     def _attempt(self, inputs: Inputs, call: _Call, *, nominal: bool = False) -> _Attempt:
         """Propose poses, refine them, and judge the best pose. ``nominal``: whether the focal length is nominal."""
         fixed = call.first_stage_only or self.effort == "fixed"
-        free = not (fixed or self._whole.compiled) and sees_values(*iter_tensors(inputs))
+        watched = *iter_tensors(inputs), *(self.parameters() if needs_graph(()) else ())  # vmap can be over parameters
+        free = not (fixed or self._whole.compiled) and sees_values(*watched)
         can_adapt = trait(self.init, "estimates_noise") and self.refine.m > 0
         adapts = free and (self.effort == "adaptive" or (can_adapt and not self.training))
         compares = free and not self.training
@@ -400,8 +401,9 @@ class PnPNet(PretrainedMixin):
         problem, frame = self.normalize(*inputs[:5], inputs.noise, inputs.confidence, inputs.rig)
         init = inputs.init
         if call.always:
-            world, img, weights = (bound_gradient(x, _LONGEST_GRADIENT) for x in problem[:3])
-            problem = problem._replace(world_points=world, img_points=img, weights=weights)
+            inner = (*problem[:3], problem.noise, problem.rig)
+            world, img, weights, noise, rig = map_tensors(lambda x: bound_gradient(x, _LONGEST_GRADIENT), inner)
+            problem = problem._replace(world_points=world, img_points=img, weights=weights, noise=noise, rig=rig)
         if inputs.prior is not None:
             term, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
             problem, init = problem._replace(pose_terms=(term,)), inputs.prior.pose if init is None else init

@@ -53,7 +53,8 @@ class Server:
                 padded = (pad_sequence(list(x), batch_first=True) for x in (world, img))
                 results = self.solver(*padded, torch.stack(cameras), mask=mask)
                 for i, (_, future) in enumerate(batch):
-                    future.set_result(map_tensors(lambda x, i=i: x[i], results))
+                    one, n = map_tensors(lambda x, i=i: x[i], results), len(world[i])
+                    future.set_result(one._replace(weights=one.weights[:n], inliers=one.inliers[:n]))
             except Exception as error:  # no error may end the thread
                 for _, future in batch:
                     future.set_exception(error)

@@ -105,7 +105,7 @@ class FromTheTruth(nn.Module):
 
     def __init__(self, solver: PnPNet) -> None:
         super().__init__()
-        self.config, self.solver = solver.config(), solver
+        self.config, self.solver = solver.config(), PnPNet(None, solver.refine, solver.normalize)
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         return self.solver(*problems[:3], init=problems.pose)
@@ -266,7 +266,7 @@ def measure_honesty(counts: Counts, _: set[str]) -> None:
     diagrams = {}
     for name, entry in sets.items():
         problems = entry.problems
-        found = reliability(solver.with_starts(*problems[:3])[1].weights, problems.inliers)
+        found = reliability(solver.with_starts(*problems[:3], first_stage_only=True)[1].weights, problems.inliers)
         lists = {key: x.nan_to_num(0.0).tolist() for key, x in found._asdict().items()}
         diagrams[name] = {**lists, "error": found.expected_error}
 

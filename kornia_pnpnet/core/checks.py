@@ -112,7 +112,8 @@ def expand_sigma(name: str, sigma: Tensor | float | None, world_points: Tensor) 
     """
     pairs = world_points.shape[:-1]
     if sigma is None or isinstance(sigma, Real):
-        return world_points.new_full(pairs, torch.nan if sigma is None else float(sigma))
+        value = torch.nan if sigma is None else float(sigma)
+        return world_points.new_full(pairs, value, dtype=torch.float64).to(world_points.dtype)  # inf if it is too large
     if not isinstance(sigma, Tensor):
         raise TypeCheckError(f"{name} must be a number or a tensor, got {type(sigma).__name__}.")
     check_devices({name: sigma}, world_points)

@@ -81,9 +81,10 @@ def needs_graph(tensors: Iterable[Tensor]) -> bool:
 
 
 def records(x: Tensor) -> bool:
-    """Whether autograd records operations on a tensor. In ``vmap``, ``requires_grad`` of the tensor itself is false."""
-    while not compiling() and torch._C._functorch.is_batchedtensor(x):
-        x = torch._C._functorch.get_unwrapped(x)
+    """Whether autograd records operations on a tensor, also outside of the transforms of ``torch.func``."""
+    functorch = torch._C._functorch
+    while not (compiling() or x.requires_grad) and functorch.is_functorch_wrapped_tensor(x):
+        x = functorch.get_unwrapped(x)
     return x.requires_grad
 
 

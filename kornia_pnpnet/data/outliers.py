@@ -45,9 +45,11 @@ class OutlierMix:
 
     Args:
         max_ratio: largest share of outliers. n * ``max_ratio`` + 0.05 is rounded down: 0.33 gives n // 3 for n <= 15.
-        count: exact number of outliers. If given, ``max_ratio``, ``min_count`` and ``min_inliers`` have no effect.
+        count: number of outliers. If given, ``max_ratio``, ``min_count`` and ``min_inliers`` have no effect. A
+            source can add outliers, for example by noise with heavy tails.
         min_count: smallest number of outliers. A ``min_count`` above the largest number is lowered to that number.
-        min_inliers: smallest number of inliers. At most n - ``min_inliers`` pairs are outliers.
+        min_inliers: smallest number of inliers, before a source adds outliers. At most n - ``min_inliers`` pairs are
+            outliers.
         mismatch_share: outliers of none of the kinds below are *mismatches* with this probability, else *sensing*
             outliers. A mismatch has the pixel of another point. A sensing outlier has a uniform pixel of the image.
         near_share: probability that an outlier is *near*. The pixel of a near outlier is close to its point's pixel.

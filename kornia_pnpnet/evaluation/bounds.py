@@ -30,7 +30,7 @@ def _least_squares(problems: Problems, weights: Tensor, **noise: Any) -> PnPResu
 class KnownInliers(Configured):
     r"""Least squares over the reprojection errors of the true inliers, starting from the true pose.
 
-    A method that must first find the inliers cannot expect a higher accuracy.
+    Pairs have equal weights. A solver that weighs pairs by their noise can be more accurate.
     """
 
     def __init__(self) -> None:

@@ -205,7 +205,7 @@ def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int)
     ok = ok.cpu() & finite
     pose = gate_pose(pose, finite, finite)
     # Solvers return the identity if they find no pose. This must not be a success where the true pose is the identity.
-    none = ~ok & (pose.matrix == torch.eye(4, dtype=torch.float64)).flatten(1).all(-1)
+    none = ~ok & (pose.matrix == torch.eye(4).to(pose.rotation)).flatten(1).all(-1)
     rotation = torch.where(none[:, None, None], pose.rotation.new_tensor(_NO_ROTATION), pose.rotation)
     errors = pose_errors(Pose(rotation, pose.translation), truth)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.cameras import focal_length, pinholes, with_undistorted
+from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.frame import F_CONST, Normalize
@@ -102,7 +103,8 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
             problem, frame = normalize(*inputs[:5], confidence=inputs.confidence)
             # `_with_distortion` uses only the prior of the distortion. The refinement also uses the prior of log f.
             known = known._replace(information=torch.zeros_like(zoom)).scaled(frame.img_scale)
-            at = _with_distortion(problem._replace(free_focal=known), frame.apply(pose), radial)
+            weights = relative(problem.weights, problem.weights)
+            at = _with_distortion(problem._replace(weights=weights, free_focal=known), frame.apply(pose), radial)
             finite = frame.valid & (at.pose.translation.sum(-1) + at.camera.sum(-1)).isfinite()
             rows = finite.nonzero()[:, 0]
             pose = put(pose, rows, take(frame.undo(at.pose), rows))

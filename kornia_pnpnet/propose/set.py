@@ -428,7 +428,7 @@ class SetInit(Initialiser):
     def _run(self, view: _View) -> tuple[Tensor, Tensor]:
         """The network's outputs per pair (1 + 2 S, B, N) and per problem (B, S + 2), for S ``starts``."""
         x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
-        absent = torch.where(view.there > 0, x.new_zeros(()), _ABSENT).contiguous()
+        absent = torch.where(view.there > 0, x.new_zeros(()), max(_ABSENT, 0.5 * torch.finfo(x.dtype).min)).contiguous()
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)

@@ -174,7 +174,7 @@ class PoseTerm(NamedTuple):
         if prior.scale is not None:
             usable = usable & (prior.scale > 1.0 / limit)
         known, symmetric = _correlations(torch.where(usable[:, None, None], prior.information, 0.0))
-        usable = usable & symmetric & (known[:, 0] > -1e3 * limits.eps)
+        usable = usable & symmetric & (known[:, 0] > -1e3 * torch.finfo(torch.float32).eps)
         rank = (usable[:, None] & (known > _KNOWN)).sum(-1).to(size)
         information = torch.where(usable[:, None, None], prior.information, 0.0)
         information = information * lengths[:, :, None] * lengths[:, None]

@@ -51,7 +51,8 @@ __all__ = ["TrainSettings", "fit", "train_briefly"]
 
 _log = logging.getLogger(__name__)
 
-# Stages of an update. The stage "rest" consists of learning curves, validations and checkpoints.
+# Stages of an update. The stage "rest" consists of learning curves and checkpoints, and in a report of the whole run
+# also of validations.
 _STAGES = ("data", "forward", "backward", "optimizer", "rest")
 _REFINES = "with refinement"  # label of the progress bar
 # Columns of the learning curves, without the columns of validations.
