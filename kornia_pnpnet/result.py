@@ -169,9 +169,9 @@ def camera_matrices(intrinsics: Tensor | PinholeCamera, size: torch.Size | None 
     if not isinstance(intrinsics, PinholeCamera):
         return intrinsics
     matrices = intrinsics.camera_matrix
-    if len(matrices) == 1:
+    if len(matrices) == 1 and matrices.ndim == 3:
         return matrices[0]
-    return matrices if size is None or len(matrices) != size.numel() else matrices.reshape(*size, 3, 3)
+    return matrices if size is None or len(matrices) != size.numel() else matrices.reshape(*size, *matrices.shape[1:])
 
 
 def check_pose(name: str, pose: Pose) -> None:

@@ -221,7 +221,7 @@ class PnPNet(PretrainedMixin):
                 term to the cost, and thus affects the refinement and the choice of the best pose. Unless ``init`` is
                 given or the focal length is unknown, the refinement also starts from the prior's pose. ``ok`` and
                 ``probability`` depend on the pairs alone. If neither call nor initialiser gives the noise, the noise of
-                pixels is assumed to be one pixel.
+                pixels is assumed to be one pixel, at most 0.01 radians.
             dist: 4, 5, 8, 12 or 14 distortion coefficients, as in Kornia and OpenCV, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.

@@ -75,7 +75,7 @@ class KnownInliersAndNoise(Configured):
 
     @torch.no_grad()  # with gradients, a NaN point would give its camera a NaN gradient
     def _inverse_variances(self, problems: Problems, img_sigma: Tensor, world_sigma: Tensor) -> Tensor:
-        """The weight of each pair in 1/px², (B, N). Outliers have the weight 0."""
+        """The weight of each pair in 1/px² at the mean focal length, (B, N). Outliers have the weight 0."""
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # the solver ignores points behind the camera
@@ -85,4 +85,5 @@ class KnownInliersAndNoise(Configured):
         trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
         img_sigma = img_sigma.maximum(LEAST_NOISE * focal.abs().amax(-1))
         variance = img_sigma.square() + world_sigma.square() * trace / 2.0
-        return torch.where(problems.inliers, variance.reciprocal(), 0.0)
+        size = focal.prod(-1).abs()  # residuals are refined at one focal length for all cameras of a rig
+        return torch.where(problems.inliers, size / size.mean(1, keepdim=True) / variance, 0.0)

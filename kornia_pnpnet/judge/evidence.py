@@ -352,6 +352,8 @@ def pose_sigma(projection: Projection, problem: Problem, precision: Tensor | Sym
     above, below = matrix.split(3, 1)
     turn, (cross, shift) = above[..., :3], below.split(3, -1)
     points = projection.rotated + projection.state.pose.translation.mT[:, None]
+    if problem.rig is not None:
+        points = points - problem.centres.permute(2, 1, 0)
     distance = points.square().sum(0).sqrt().mT.double()
     share = (precision if isinstance(precision, Tensor) else precision.uu).double()
     total = share.sum(-1).clamp(min=torch.finfo(torch.float32).tiny)

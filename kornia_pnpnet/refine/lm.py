@@ -48,6 +48,8 @@ _T = TypeVar("_T")
 # Upper bound of a residual in the cost, in focal lengths. Points behind the camera have this residual, so that no point
 # in front of the camera costs more.
 _MAX_RESIDUAL = 2.0
+# Largest assumed noise of a pixel in focal lengths: for bearings without intrinsics, one "pixel" would be one radian.
+_LARGEST_PIXEL = 0.01
 # With `reject_worse`, a step is rejected only if the cost rises by more than this number of units in the last place.
 _ROUNDING = 100.0
 # Estimated noise of points is replaced by 0 only if 0 raises the log-likelihood by more than this number. If the number
@@ -397,7 +399,7 @@ class RobustWeightedLM(Configured):
         sq_residual, precision = information(projection, problem)
         robust = self.kernel.weight(sq_residual, shape)
         if problem.noise is None and problem.terms:  # sigma is one pixel of the caller
-            robust = robust / problem.img_scale.square()[:, None]
+            robust = robust / _pixel(problem).square()[:, None]
         return projection, self._equations(projection, problem, robust, precision)
 
     def _equations(
@@ -429,7 +431,7 @@ class RobustWeightedLM(Configured):
         sq_residual = torch.where(projection.in_front, sq_residual.minimum(most), most)
         count = (problem.weights > 0).sum(-1).clamp(min=1)
         total = (prior * self.kernel.loss(sq_residual, shape)).sum(-1)
-        unit = problem.img_scale.square() if problem.noise is None else 1.0  # `None`: sigma is one pixel of the caller
+        unit = _pixel(problem).square() if problem.noise is None else 1.0  # `None`: sigma is one pixel of the caller
         for term in problem.terms:
             total = total + unit * term.loss(projection.state)
         return total / count
@@ -479,6 +481,11 @@ def taken(tree: _T, index: Tensor) -> _T:
     return map_tensors(select, tree)
 
 
+def _pixel(problem: Problem) -> Tensor:
+    """One pixel of the caller, at most `_LARGEST_PIXEL`, in the problem's pixels, shape (B,)."""
+    return problem.img_scale.clamp(max=_LARGEST_PIXEL * problem.focal)
+
+
 def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
     """Complete the noise of every pair. The initialiser gives the sigmas that the problem lacks.
 
@@ -490,7 +497,7 @@ def _complete_noise(problem: Problem, starts: Starts) -> Noise | None:
     if given is None:
         return None if guess is None else guess.bounded(problem.focal)
     if guess is None:
-        pixel = problem.img_scale[:, None] if problem.terms else torch.ones_like(problem.img_scale[:, None])
+        pixel = (_pixel(problem) if problem.terms else torch.ones_like(problem.img_scale))[:, None]
         guess = Noise(_mean_known(given.img, pixel), _mean_known(given.world, torch.zeros_like(pixel)))
     noise = map_tensors(lambda x, y: torch.where(x.isnan(), y, x), given.sigmas, guess)
     return noise._replace(img_cov=given.img_cov, world_cov=given.world_cov).bounded(problem.focal)
