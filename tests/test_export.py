@@ -151,13 +151,6 @@ def test_what_cannot_be_exported_leaves_the_old_file(name, chosen, options, tmp_
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_solvers_that_the_command_cannot_export(tmp_path, capsys):
-    for arguments, reason in ((["opencv-ransac"], "opencv-ransac"), (["identity-lm", "--rig"], "rigs")):
-        assert main(["export", str(tmp_path / "x.onnx"), "--solver", *arguments]) == 2
-        assert reason in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(("name", "missing"), [("x.onnx", "onnx"), ("x.onnx", "onnxscript"), ("x.pt2", "compiler")])
 def test_what_an_export_needs_is_checked_before_it_starts(name, missing, tmp_path, monkeypatch, capsys):
     export = export_package if missing == "compiler" else export_onnx

@@ -90,6 +90,16 @@ def test_an_unknown_focal_length_has_any_nominal_value(information):
     torch.testing.assert_close(*sigmas)
 
 
+def test_the_frame_of_a_rig_is_free():
+    problem, pose = scene(12, 0, 1.0)
+    eye, sigmas = torch.eye(3).double().expand(50, 12, 3, 3), []
+    for shift in torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 50.0]]).double():
+        moved, rig = State.of(Pose(pose.rotation, pose.translation - shift)), Pose(eye, shift.expand(50, 12, 3))
+        rigs = problem._replace(rig=rig)
+        sigmas.append(pose_sigma(project(moved, rigs), rigs, torch.ones_like(problem.weights)))
+    torch.testing.assert_close(*sigmas)
+
+
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac", "epnp-lm", "pnpnet-n20"])
 def test_doubtful_poses_are_not_ok_and_right_poses_of_tags_are(name):
     for kind in doubtful(100, seed=41):

@@ -264,6 +264,26 @@ def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, m
     assert (solver.training, solver.refine.training) == (True, False)
 
 
+@pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
+@pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9"])
+def test_vmap_over_parameters_has_the_fixed_effort(name, make_problems):
+    p, solver = make_problems(9, 4, outliers=3), create_solver(name)
+    parameters, _ = torch.func.stack_module_state([solver, solver])
+    solve = partial(torch.func.functional_call, solver, args=tuple(p[:3]))
+    found = torch.func.vmap(lambda x: solve(x).translation)(parameters)
+    expected = create_solver(name, effort="fixed")(*p[:3]).translation
+    torch.testing.assert_close(found, torch.stack((expected, expected)), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own use of it in forward mode
+def test_a_transform_over_one_argument_keeps_the_gradient_of_another(make_problems):
+    p, solver = make_problems(9, 4), create_solver("epnp")
+    world = p.world_points.requires_grad_()
+    alone = solver(world, *p[1:3]).translation
+    primal, _ = torch.func.jvp(lambda x: solver(world, x, p.intrinsics).translation, (p.img_points,), (p.img_points,))
+    assert_same(*(torch.autograd.grad(x.sum(), world) for x in (alone, primal)), rtol=1e-9, atol=1e-9)
+
+
 #: What a random damage, of which ``test_interruptions.py`` tries many, does not do.
 DAMAGES = [
     lambda config, weights: torch.save({"a": torch.zeros(1)}, weights),

@@ -200,7 +200,6 @@ class Uneven(SyntheticProblems):
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 @pytest.mark.parametrize("source", [SyntheticProblems, Uneven])
 def test_two_processes_equal_one(source, tmp_path):
-
     def parts():
         data = source(n=6, batch_size=16, seed=3, outliers=OutlierMix(), dtype=torch.float64)
         return {**make_parts(dtype=torch.float64), "validation": {}, "data": data}
@@ -228,14 +227,10 @@ def test_validation_has_its_own_interval_and_does_not_change_the_training(tmp_pa
     assert [row["update"] for row in rows if row["val/none/success"]] == ["3", "6", "9"]
 
 
-class SlowSource(SyntheticProblems):
-    def batch(self, index):
-        time.sleep(0.5)
-        return super().batch(index)
-
-
-def test_shares_of_the_time_add_up_and_show_slow_data(tmp_path):
-    shares = fit(folder=tmp_path, **{**make_parts(), "data": SlowSource(n=6, batch_size=16)}).time_shares
+def test_shares_of_the_time_add_up_and_show_slow_data(tmp_path, monkeypatch):
+    draw, parts = SyntheticProblems.batch, make_parts()
+    monkeypatch.setattr(SyntheticProblems, "batch", lambda *x: time.sleep(0.5) or draw(*x))
+    shares = fit(folder=tmp_path, **parts).time_shares
     assert shares["data"] == max(shares.values())
     for row in ({f"{stage}_share": x for stage, x in shares.items()}, *read_history(tmp_path)):
         values = [float(row[share]) for share in SHARES]
