@@ -394,7 +394,7 @@ class PnPNet(PretrainedMixin):
                 rival, replaced = find_focal(problem, now.state, doubted)
             now, found, odds = reconsider(self.refine, plan, now, found, frame.valid, rival, replaced)
         refined = self._run(self.refine.judge, plan, now, found, odds)
-        result = self._run(self._result, problem.focal, frame, starts, refined, call)
+        result = self._run(self._result, problem, frame, starts, refined, call)
         return _Attempt(problem, frame, starts, refined, result)
 
     def _propose(self, inputs: Inputs, call: _Call, searches: bool) -> tuple[Problem, Frame, Starts]:
@@ -425,7 +425,7 @@ class PnPNet(PretrainedMixin):
         starts = propose(self.init, problem, given, views=views, order=order, fixed=fixed, search_follows=searches)
         return problem, frame, starts
 
-    def _result(self, focal: Tensor, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
+    def _result(self, problem: Problem, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:
         """Express the refined state in the caller's world."""
         pose, first = frame.undo(refined.pose), frame.undo(starts.pose)
         # A sum is finite only if all its terms are finite. The translation has the product of rotation and centroid as
@@ -447,7 +447,7 @@ class PnPNet(PretrainedMixin):
         live = finite if call.always else ok
         pose = gate_pose(pose, live, finite)
         with torch.no_grad():
-            sigma = torch.where(finite, found.sigma * focal / frame.img_scale, 0.0)
+            sigma = torch.where(finite, found.sigma * problem.focal / frame.img_scale, 0.0)
         # In a rig, `forward` replaces `None` by the caller's cameras.
         cameras: Any = None if intrinsics.ndim > 3 else gate(intrinsics, live, torch.ones_like(finite), 0.0)
         return PnPResult(
