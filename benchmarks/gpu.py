@@ -308,7 +308,11 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
                 break  # it has failed to compile, and runs uncompiled from now on
             place["warm_s"] = time.perf_counter() - start
             each = work(plain, take(problems, slice(1000)), backward=mode == BACKWARD)
-            place["peak_bytes"] = peak_bytes(task, device)
+            if device != "cpu":
+                torch.cuda.reset_peak_memory_stats(device)
+                before = torch.cuda.memory_allocated(device)
+                task.seconds()
+                place["peak_bytes"] = torch.cuda.max_memory_allocated(device) - before
             found = summary([task.us() for _ in range(amount.rounds)])
             known[mode].append((batch, found["median_us"] * batch / 1e6))
             floor_s = max(each["least_bytes"] / rates["bytes_per_s"], each["flops"] / rates["flops_per_s"])
@@ -325,16 +329,6 @@ def _expected_s(known: list[tuple[int, float]], batch: int) -> float:
         return known[0][1] if known else 0.0
     (small, one), (large, other) = known[-2:]
     return other + max(other - one, 0.0) * (batch - large) / (large - small)
-
-
-def peak_bytes(task: Task, device: str) -> int | None:
-    """Most bytes that PyTorch allocates on the GPU during a call, beyond those before it."""
-    if device == "cpu":
-        return None
-    torch.cuda.reset_peak_memory_stats(device)
-    before = torch.cuda.memory_allocated(device)
-    task.seconds()
-    return torch.cuda.max_memory_allocated(device) - before
 
 
 Part = Callable[[str, Amount], Iterator[dict[str, Any]]]

@@ -149,10 +149,14 @@ def measure_latency(settings: Settings, count: int) -> dict[str, list[dict[str, 
     tasks = {}
     for name, contender in contenders.items():
         say(f"latency: {count} thread(s), {name}")
+        single = [contender.task(take(problems, slice(i, i + 1))) for i in range(len(problems.world_points))]
         try:
-            tasks[name] = single_tasks(contender, problems, settings)
+            tasks[name] = single[: max(_TURN, int(settings.latency_s / single[0].warm()))]
         except CannotBeTimedError as error:
             skipped.append({"contender": name, "why": str(error)})
+            continue
+        for task in single[:_WARM]:
+            task.seconds()
     times = latencies(tasks)
     for name, mine in tasks.items():
         success = contenders[name].task(problems).success()._asdict()
@@ -163,15 +167,6 @@ def measure_latency(settings: Settings, count: int) -> dict[str, list[dict[str, 
         row |= {"median_us": statistics.median(times[name]), **tail, "max_us": spread[-1]}
         rows.append({**row, "quantiles_us": [round(value, 2) for value in spread]})
     return {"rows": rows, "skipped": [{**entry, "threads": count} for entry in skipped]}
-
-
-def single_tasks(contender: Contender, problems: Problems, settings: Settings) -> list[Task]:
-    """Warm tasks of one problem each, for ``settings.latency_s`` seconds of calls."""
-    tasks = [contender.task(take(problems, slice(i, i + 1))) for i in range(len(problems.world_points))]
-    tasks = tasks[: max(_TURN, int(settings.latency_s / tasks[0].warm()))]
-    for task in tasks[:_WARM]:
-        task.seconds()
-    return tasks
 
 
 def latencies(tasks: Mapping[str, Sequence[Task]]) -> dict[str, list[float]]:

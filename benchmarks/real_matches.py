@@ -323,8 +323,7 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
 def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
     """Solve a batch; the result, and milliseconds of the processor for a problem.
 
-    A bound sees the reference poses. Other libraries with a ratio get the best pairs first, and only their own calls
-    are timed.
+    A bound sees the reference poses. Peers with a ratio get the best pairs first; only their own calls are timed.
     """
     known: dict[str, Any] = {}
     if CONFIDENCE in spec and isinstance(solver, PeerSolver):

@@ -37,8 +37,7 @@ class Server:
         pairs = len(world_points)
         if (world_points.shape, img_points.shape, intrinsics.shape) != ((pairs, 3), (pairs, 2), (3, 3)):
             raise ValueError("expected shapes (N, 3), (N, 2) and (3, 3)")
-        inputs = (world_points, img_points, intrinsics)
-        self.waiting.put((tuple(x.to("cpu", torch.float32) for x in inputs), future))  # alike, for one batch
+        self.waiting.put((tuple(x.to("cpu", torch.float32) for x in (world_points, img_points, intrinsics)), future))
         return future.result()
 
     def _run(self) -> None:

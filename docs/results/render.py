@@ -48,18 +48,13 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, An
     return dict(sorted(found.items(), key=lambda x: (x[0] != ANY, -x[1][0]["success"]["rate"])))
 
 
-def times(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Microseconds without outliers and with 3 of 9, by the names of the solvers."""
-    named = [{**row, "name": row["solver"].partition(":")[0]} for row in rows if row["set"] in TIMED_SETS]
-    return {name: [f"{row['median_us']:.0f}" for row in own] for name, own in grouped(named, "name").items()}
-
-
 def page(overview: str) -> str:
     """The results page as Markdown, with an overview of real matches."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
     complexity, runs = load("complexity"), {name: rates.read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
     benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
     rigs = grouped(cameras["rigs"], "solver")
+    timed = grouped((row for row in benchmark["rows"] if row["set"] in TIMED_SETS), "solver")
     at_nine = complexity["n"].index(9)
     any_network: Any = PnPNet.from_pretrained(ANY).init
     files = {name: rates.Rates(entry) for name, entry in results.items()}
@@ -80,7 +75,7 @@ def page(overview: str) -> str:
         unknown_focal=grouped(cameras["real"], "solver"),
         rigs=rigs,
         rig_batch=cameras["settings"]["count"],
-        times=times(benchmark["rows"]),
+        times={x.partition(":")[0]: [f"{row['median_us']:.0f}" for row in own] for x, own in timed.items()},
         rig_ratios=[other["us"] / own["us"] for own, other in zip(rigs[ANY], rigs["PoseLib"], strict=True)],
         beside_robust=rates.compare_all((files["set"], files["set_real"]), ANY, ROBUST),
         beside_peers=rates.compare_all((files["set"], files["set_real"]), ANY, PEERS),
