@@ -295,7 +295,7 @@ def is_refused(call: Call) -> bool:
     return bool(
         (call.n < 3 and "solves" in call.target.kinds)
         or (call.n != PAIRS.get(call.name, call.n) and not of_rig)  # the network of a rig's solver makes no guess
-        or (call.n < 7 and call.name == "ransac-epnp-lm")  # its sample
+        or (call.n < 7 and call.name == "ransac-epnp-lm" and not of_rig)  # its sample
         or (of_rig and (lenses or unknown or x.get("alternatives") or (call.name == "identity-lm" and "init" not in x)))
         or ("intrinsics" in x and x["intrinsics"] is None and not of_rig)
         or lenses + unknown > 1
