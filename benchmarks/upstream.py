@@ -111,11 +111,11 @@ def measure_success(count: int, cells: Sequence[tuple[int, float]] = CELLS) -> l
 def measure_batches(batches: Sequence[int] = BATCHES) -> list[dict[str, Any]]:
     """Time per problem by batch size, with 30 pairs of which a quarter are outliers."""
     robust = patched()
-    problems = random_cameras(30, max(batches), SEED + 50, 0.25)
-    rows = []
+    problems, rows = random_cameras(30, max(batches), SEED + 50, 0.25), list[dict[str, Any]]()
+    opencv_us = _opencv(problems)[1]  # problem by problem, whatever the batch
     for batch in batches:
         say(f"batches of {batch}")
-        rows.append({"batch": batch, "us": _timed(robust, problems, batch)[1], "opencv_us": _opencv(problems)[1]})
+        rows.append({"batch": batch, "us": _timed(robust, problems, batch)[1], "opencv_us": opencv_us})
     return rows
 
 

@@ -87,16 +87,15 @@ class Solve:
             intrinsics = intrinsics.float()
         if options and not isinstance(solver, str):
             raise ValueCheckError(f"Options are for the name of a solver, got a module and {sorted(options)}.")
-        with torch.device("cpu"):  # tables are solved on the CPU, whatever the default device is
+        with torch.device("cpu"):  # tables are on the CPU, even if PyTorch's default device is a GPU
             self.solver = create_solver(solver, **options) if isinstance(solver, str) else solver
         self.intrinsics = intrinsics
 
     def __call__(self, table: pa.Table) -> pa.Table:
         """Solve a table.
 
-        Missing columns, columns of equal names, and the columns ``mask``, ``confidence`` and ``weight``, which would
-        have no effect, raise ``ValueCheckError``. Columns without numbers raise
-        ``TypeCheckError``.
+        Missing columns, columns of equal names, and columns without effect (``mask``, ``confidence``, ``weight``) raise
+        ``ValueCheckError``. Columns without numbers raise ``TypeCheckError``.
         """
         if double := {name for name in table.column_names if table.column_names.count(name) > 1}:
             raise ValueCheckError(f"the table has several columns {', '.join(sorted(double))}")

@@ -23,7 +23,7 @@ from torch.nn.functional import normalize
 from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, check_tensors, common_dtype
 from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.frame import scaled_cameras
+from kornia_pnpnet.frame import focal_length, scaled_cameras
 from kornia_pnpnet.problem import Inputs, Noise
 from kornia_pnpnet.result import Pose, sound_pose
 
@@ -31,7 +31,6 @@ __all__ = [
     "bearing_cameras",
     "bearings",
     "check_coefficients",
-    "focal_length",
     "looking_along",
     "pinholes",
     "reproject",
@@ -231,11 +230,6 @@ def pinholes(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Scale camera matrices (*, 3, 3), and tell which are valid, see :func:`~kornia_pnpnet.frame.scaled_cameras`."""
     entries, sound = scaled_cameras(intrinsics.flatten(-2).movedim(-1, 0))
     return entries.movedim(0, -1).unflatten(-1, (3, 3)), sound
-
-
-def focal_length(camera: Tensor) -> Tensor:
-    """Return the geometric mean of |fx| and |fy|, shape (*), for valid camera matrices (*, 3, 3)."""
-    return (camera[..., 0, 0] * camera[..., 1, 1]).abs().sqrt()
 
 
 def reproject(world_points: Tensor, intrinsics: Tensor, pose: Pose) -> Tensor:

@@ -12,10 +12,10 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
-from kornia_pnpnet.cameras import focal_length, zoomed
+from kornia_pnpnet.cameras import zoomed
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.frame import Normalize
+from kornia_pnpnet.frame import Normalize, focal_length
 from kornia_pnpnet.problem import MIN_PAIRS, Noise, State
 from kornia_pnpnet.refine.residual import information, normal_equations, pixel_variance, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term

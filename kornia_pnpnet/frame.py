@@ -17,7 +17,7 @@ from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose, Status, sound_pose
 
-__all__ = ["F_CONST", "Frame", "Normalize", "scaled_cameras"]
+__all__ = ["F_CONST", "Frame", "Normalize", "focal_length", "scaled_cameras"]
 
 #: Focal length of the normalised camera in pixels. (Cameras of ETH3D have focal lengths of 3400 to 3430.)
 F_CONST = 3400.0
@@ -92,7 +92,7 @@ class Frame(NamedTuple):
             img, world = map(self.undo_pairs, noise[:2])
             img_scale = self.img_scale[:, None]
             if self.intrinsics.ndim > 3:  # the cameras of a rig have their own scales
-                img_scale = focal / (self.intrinsics[..., 0, 0] * self.intrinsics[..., 1, 1]).abs().sqrt()
+                img_scale = focal / focal_length(self.intrinsics)
             noise = Noise(img / img_scale, world * self.size[:, None])
         others = None if starts.others is None else self.undo(starts.others)
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
@@ -299,6 +299,11 @@ class Normalize(Configured):
             noise, confidence, rig = pairs_at((noise, confidence, rig), order)
         scales = mean_scale, size.reciprocal(), is_usual.mT
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
+
+
+def focal_length(camera: Tensor) -> Tensor:
+    """Return the geometric mean of |fx| and |fy|, shape (*), for valid camera matrices (*, 3, 3)."""
+    return (camera[..., 0, 0] * camera[..., 1, 1]).abs().sqrt()
 
 
 def scaled_cameras(camera: Tensor) -> tuple[Tensor, Tensor]:

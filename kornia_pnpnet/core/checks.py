@@ -44,11 +44,16 @@ def check_positive(*, or_infinite: bool = False, **values: Any) -> None:
         KORNIA_CHECK(positive, f"{name} must be a positive number, got {value!r}.")
 
 
+def are_rising(values: Any, low: float, high: float = math.inf) -> bool:
+    """Tell whether ``values`` are two finite numbers in ``[low, high]``, the second not smaller."""
+    two_numbers = hasattr(values, "__len__") and len(values) == 2 and all(map(_is_number, values))
+    return two_numbers and low <= values[0] <= values[1] <= high
+
+
 def check_ranges(**values: Any) -> None:
     """Raise ``BaseError`` unless each value is a pair of finite numbers ``(low, high)`` with ``0 < low <= high``."""
     for name, value in values.items():
-        two_numbers = hasattr(value, "__len__") and len(value) == 2 and all(map(_is_number, value))
-        in_order = two_numbers and 0 < value[0] <= value[1]
+        in_order = are_rising(value, 0.0) and value[0] > 0
         KORNIA_CHECK(in_order, f"{name} must be two positive numbers, the second not smaller, got {value!r}.")
 
 

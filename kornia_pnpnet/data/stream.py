@@ -61,7 +61,7 @@ def stream_batches(source: ProblemSource, start: int, stop: int, workers: int = 
         # In joblib's processes, the default start method is joblib's own. A loader cannot use that method.
         multiprocessing_context=None if multiprocessing.get_start_method() in methods else methods[0],
     )
-    with torch.device("cpu"):  # the loader draws a seed by a generator of the CPU, whatever the default device is
+    with torch.device("cpu"):  # the loader's generator is on the CPU, even if PyTorch's default device is a GPU
         arrays: Any = iter(loader)
     # At exit, multiprocessing sends one SIGTERM to each worker and waits. Workers ignore the first SIGTERM, so this
     # finalizer ends the workers earlier.

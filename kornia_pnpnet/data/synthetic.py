@@ -13,7 +13,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_ranges, check_whole
+from kornia_pnpnet.core.checks import are_rising, check_numbers, check_positive, check_ranges, check_whole
 from kornia_pnpnet.data.draws import RandomProblems, log_uniform, normal, random_poses, uniform, unit
 from kornia_pnpnet.data.outliers import OutlierKind, OutlierMix, crowd_leaders, near_offsets, structured_points
 from kornia_pnpnet.data.points import BoxPoints, DepthMaps, PointPrior
@@ -333,8 +333,8 @@ class CameraProblems(RandomProblems):
         check_numbers(0.0, 1.0, outlier_share=self.outlier_share)
         for name, low, high in (("field_of_view", 1e-3, 170.0), ("depth_spread", 0.0, 0.95)):
             values = getattr(self, name)
-            rising = hasattr(values, "__len__") and len(values) == 2 and low <= values[0] <= values[1] <= high
-            KORNIA_CHECK(rising, f"{name} must be two rising numbers in [{low:g}, {high:g}], got {values!r}.")
+            message = f"{name} must be two rising numbers in [{low:g}, {high:g}], got {values!r}."
+            KORNIA_CHECK(are_rising(values, low, high), message)
 
     def _draw(self, generator: torch.Generator) -> Problems:
         size, each = (self.batch_size, self.n), (self.batch_size, 1)

@@ -177,10 +177,10 @@ def reconsider(
     if by_residual and len(rows):
         at = end[best[rows], rows]
         now, found = put((now, found), rows, take((tried, of_ends), at))
+        lost = rotation_angle(pose.rotation[rows], now.state.pose.rotation[rows]) > FAR_TURN
+        others[0, rows] = torch.where(lost, likelihood[0, rows], -torch.inf)  # the beaten pose is a rival, too
     far = rotation_angle(tried.state.pose.rotation, now.state.pose.rotation[owners]) > FAR_TURN
     others[kind, owners] = torch.where(far, likelihood[kind, owners], -torch.inf)
-    lost = rotation_angle(pose.rotation, now.state.pose.rotation) > FAR_TURN  # a refined pose that a rival has beaten
-    others[0] = torch.where(lost, likelihood[0], -torch.inf)
     return now, found, likelihood.amax(0) - others.amax(0)
 
 

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_pnpnet.cameras import focal_length, pinholes, with_undistorted
+from kornia_pnpnet.cameras import pinholes, with_undistorted
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.core.trees import map_tensors, put, take
-from kornia_pnpnet.frame import F_CONST, Normalize
+from kornia_pnpnet.frame import F_CONST, Normalize, focal_length
 from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC

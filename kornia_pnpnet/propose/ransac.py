@@ -237,8 +237,7 @@ def search_on(
     known, noise = problem.noise, constant.noise
     if noise is None:
         raise ValueCheckError('effort="adaptive" needs an initialiser that estimates the noise, like SetInit.')
-    problem = problem._replace(noise=None, weights=relative(problem.weights, problem.weights))
-    problem = problem.map(lambda x: x.detach().contiguous())
+    problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
     depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)
     if known is None:
@@ -260,6 +259,7 @@ def search_on(
     if len(rows):
         given = map_tensors(lambda *x: torch.stack(x, 1), *take(constant.poses, rows))
         some, limits, chances, sigma = take((problem, thresholds, chances, sigma), rows)
+        some = some._replace(weights=relative(some.weights, some.weights))
         search = Search(_FURTHER, some, limits, chances, sigma, finds_rivals=True, ranks=True)
         search.run(given)
         state, rivals = search.state, (rows, as_pose(search.rivals.to(problem.weights)))

@@ -26,7 +26,7 @@ from torch import nn
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
+from kornia_pnpnet.core.checks import are_rising, check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.environment import peak_resident_bytes
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -108,8 +108,7 @@ class TrainSettings:
         check_numbers(0.0, lr=self.lr, lr_refine=self.lr_refine)
         check_positive(clip=self.clip, or_infinite=True)
         check_numbers(0.0, 1.0, final_lr=self.final_lr)
-        rises = hasattr(self.ramp, "__len__") and len(self.ramp) == 2 and 0.0 <= self.ramp[0] <= self.ramp[1] < math.inf
-        KORNIA_CHECK(rises, f"ramp must be two shares, the second not smaller, got {self.ramp}.")
+        KORNIA_CHECK(are_rising(self.ramp, 0.0), f"ramp must be two shares, the second not smaller, got {self.ramp}.")
 
     def lr_factor(self, update: int) -> float:
         """Factor that multiplies the learning rates: a linear warm-up times a cosine from 1 to ``final_lr``."""
