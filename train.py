@@ -40,6 +40,8 @@ def main(config: DictConfig) -> float | None:
     runtime = HydraConfig.get()
     sweeps = runtime.mode == RunMode.MULTIRUN
     folder = Path(runtime.runtime.output_dir)
+    if sweeps and ".." in Path(runtime.sweep.subdir).parts:  # all runs could get the same folder
+        raise TrainingError(f"The overrides name the run's folder: {runtime.sweep.subdir}. Pass paths without '..'.")
     try:
         fabric = instantiate(config.engine)
     except InstantiationException as error:

@@ -83,13 +83,17 @@ def oracle(problems: Problems) -> Found:
     return Found(result.pose, result.intrinsics[:, 0, 0], result.ok, 0.0)
 
 
-def one_by_one(solve: Callable[..., tuple[np.ndarray, float] | None], *inputs: Tensor) -> Found:
-    """Call a function for each problem, which returns the pose (3, 4) and the focal length, or ``None``."""
+def one_by_one(prepare: Callable[..., Callable[[], tuple[np.ndarray, float] | None]], *inputs: Tensor) -> Found:
+    """Solve each problem by a call of its own, which returns the pose (3, 4) and the focal length, or ``None``.
+
+    ``prepare`` makes the call of a problem, with the objects that the library needs. Only the calls are timed.
+    """
     problems = list(zip(*(x.double().numpy() for x in inputs), strict=True))
+    calls = [prepare(*one) for one in problems]
     with harness.threads():
-        solve(*problems[0])  # not timed
+        prepare(*problems[0])()  # not timed
         start = time.perf_counter()
-        found = [solve(*one) for one in problems]
+        found = [call() for call in calls]
         us = 1e6 * (time.perf_counter() - start) / len(found)
     columns = zip(*(x or (np.eye(3, 4), 1.0) for x in found), strict=True)
     pose, focal = (torch.from_numpy(np.array(x, dtype=np.float64)) for x in columns)
@@ -103,8 +107,12 @@ def colmap_focal(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> 
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=int(size[0]), height=int(size[1]), params=guess)
     estimation: Any = {"estimate_focal_length": True, "ransac": {"max_error": THRESHOLD, "random_seed": 0}}
     refinement: Any = {"refine_focal_length": True}
-    found = pycolmap.estimate_and_refine_absolute_pose(img, world, camera, estimation, refinement)
-    return found and (found["cam_from_world"].matrix(), float(found.get("camera", camera).params[0]))
+
+    def call() -> Any:
+        found = pycolmap.estimate_and_refine_absolute_pose(img, world, camera, estimation, refinement)
+        return found and (found["cam_from_world"].matrix(), float(found.get("camera", camera).params[0]))
+
+    return call
 
 
 def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> Any:
@@ -122,7 +130,7 @@ def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) ->
 #: Solvers of other libraries without the focal length.
 FOCAL_PEERS: dict[str, Callable[[Problems], Found]] = {
     "pycolmap": lambda problems: one_by_one(colmap_focal, *problems[:3]),
-    "opencv, 21 focals": lambda problems: one_by_one(opencv_focals, *problems[:3]),
+    "opencv, 21 focals": lambda problems: one_by_one(partial(partial, opencv_focals), *problems[:3]),
 }
 BY_FOCAL = (*OURS, *FOCAL_PEERS, "oracle")
 
@@ -141,8 +149,12 @@ def poselib_rig(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, plac
     for camera, place in zip(extrinsics, places, strict=True):
         camera.R, camera.t = place[:, :3], place[:, 3]
     pairs = [[x[c::cameras] for c in range(cameras)] for x in (img, world)]
-    pose, report = poselib.estimate_generalized_absolute_pose(*pairs, extrinsics, models, options, {})
-    return (np.column_stack((pose.R, pose.t)), 1.0) if report["num_inliers"] else None
+
+    def call() -> Any:
+        pose, report = poselib.estimate_generalized_absolute_pose(*pairs, extrinsics, models, options, {})
+        return (pose.Rt, 1.0) if report["num_inliers"] else None
+
+    return call
 
 
 def pycolmap_rig(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, places: np.ndarray) -> Any:
@@ -151,8 +163,12 @@ def pycolmap_rig(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray, pla
     at = [*(np.arange(len(world)) % len(places))]
     cameras = [pycolmap.Camera(**model) for model in pinholes(intrinsics)]
     rigid = [pycolmap.Rigid3d(x) for x in places]
-    found = pycolmap.estimate_and_refine_generalized_absolute_pose(img, world, at, rigid, cameras, options)
-    return found and (found["rig_from_world"].matrix(), 1.0)
+
+    def call() -> Any:
+        found = pycolmap.estimate_and_refine_generalized_absolute_pose(img, world, at, rigid, cameras, options)
+        return found and (found["rig_from_world"].matrix(), 1.0)
+
+    return call
 
 
 #: Solvers of other libraries for rigs.

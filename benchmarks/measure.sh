@@ -10,7 +10,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 PYTHON=${PYTHON:-python}
-if ! git diff --quiet HEAD -- '*.py' conf; then
+if ! git diff --quiet HEAD -- '*.py' kornia_pnpnet conf; then
     echo "Commit the changes of code first: results files name their commit."
     exit 1
 fi
@@ -77,6 +77,7 @@ if [ -n "${MATCHES:-}" ]; then
     done
     for pixels in 2 3 4 6 8; do
         grid="$grid p3p-ransac:threshold=$pixels pycolmap:threshold=$pixels opencv-usac:threshold=$pixels"
+        grid="$grid pycolmap:threshold=$pixels,max_iterations=100000"
         grid="$grid pycolmap:threshold=$pixels,loss_scale=1,max_iterations=100000"
         grid="$grid opencv-usac:threshold=$pixels,iterations=100000"
     done

@@ -91,8 +91,8 @@ _LAST_SHARE = 0.99  # share of the calls drawn; other programs delayed the slowe
 
 def plot_times(path: Path, title: str, panels: Mapping[str, Sequence[Row]], *, against: str, label: str) -> Path:
     """Draw the time per problem against a column of the rows, one panel for each list of rows."""
-    tables = {name: pd.DataFrame(rows).assign(solver=lambda one: one.contender) for name, rows in panels.items()}
-    columns = {"median_us": "us", against: label}
+    tables = {name: pd.DataFrame(rows) for name, rows in panels.items()}
+    columns = {"contender": "solver", "median_us": "us", against: label}
     curves = [(name, one.rename(columns=columns), "us") for name, one in tables.items()]
     return figures.draw_curves(path, [title], curves, label, _looks(pd.concat(tables.values()).contender))
 
@@ -101,14 +101,14 @@ def plot_times(path: Path, title: str, panels: Mapping[str, Sequence[Row]], *, a
 def plot_latency(path: Path, title: str, rows: Sequence[Row]) -> Path:
     """Draw the share of the calls with one problem that end within a time, without the slowest hundredth."""
     rows = [row for row in rows if not row["contender"].endswith(_NOT_DRAWN)]
-    looks = _looks(row["contender"] for row in rows)
+    found, looks = matching(rows), _looks(row["contender"] for row in rows)
     figure = make_figure(WIDTH, 4.8, title)
     axes = figure.subplots()
-    for name, row in sorted(matching(rows).items(), key=lambda x: list(looks).index(x[0])):
-        shares = np.linspace(0, 1, len(row["quantiles_us"]))
+    for name, look in looks.items():
+        times = np.array(found[name]["quantiles_us"]) / 1e3
+        shares = np.linspace(0, 1, len(times))
         kept = shares <= _LAST_SHARE
-        x, y = np.array(row["quantiles_us"])[kept] / 1e3, 100 * shares[kept]
-        axes.plot(x, y, **looks[name], markevery=max(1, len(x) // 5))
+        axes.plot(times[kept], 100 * shares[kept], **look, markevery=max(1, int(kept.sum()) // 5))
     axes.set(xlabel="ms for one problem", ylabel="calls done (%)", ylim=(0, 100))
     log_scale(axes, "x")
     figures.draw_legend(figure, looks)

@@ -134,7 +134,7 @@ class Solved(NamedTuple):
     pose: Pose
     ok: Tensor
     milliseconds: Tensor  # of the processor, the same for all problems of a batch
-    probability: Tensor  # NaN where the solver has none
+    probability: Tensor  # NaN for problems that do not count
 
 
 def read_views(folder: Path) -> list[View]:
@@ -332,10 +332,10 @@ def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -
         given, mask = given._replace(world_points=world, img_points=img), mask.gather(1, order)
     elif CONFIDENCE in spec:
         known = {"confidence": 1 - ratio}
-    start = time.process_time()
+    start = time.perf_counter()
     bound = isinstance(solver, SeesTruth)
     result = solver.solve_with_truth(given) if bound else solver(*given[:3], mask=mask, **known)
-    seconds = solver.library_s if isinstance(solver, PeerSolver) else time.process_time() - start
+    seconds = solver.library_s if isinstance(solver, PeerSolver) else time.perf_counter() - start
     return result, 1e3 * seconds / len(mask)
 
 
@@ -357,8 +357,7 @@ def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int) -> dict
             one.pose.rotation[at] = rotation = result.rotation.double()
             one.pose.translation[at] = result.translation.double() - (rotation @ origin[..., None])[..., 0]
             one.ok[at] = result.ok
-            if result.probability is not None:
-                one.probability[at] = result.probability.double()
+            one.probability[at] = result.probability.double()
     return found
 
 

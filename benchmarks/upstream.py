@@ -9,8 +9,8 @@ iterations) has the same threshold as the patch, 3 px, and refines on its inlier
 *Descent.* 40 steps of Adam on the pixels through a solver, as in training: 12 pairs with 5 px of noise. The loss is the
 squared chordal distance of the rotations plus the squared error of the position in median distances.
 
-The patched function runs in float32 in calls of 100 problems, OpenCV problem by problem. Times are CPU times of one
-thread.
+The patched function runs in float32 in calls of 100 problems, OpenCV problem by problem. Times are those of
+one thread.
 """
 
 import os
@@ -18,7 +18,6 @@ import re
 import runpy
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,7 +74,7 @@ def _timed(solve: Solve, problems: Problems, call: int) -> tuple[Tensor, float]:
     with threads(), torch.no_grad():
         solve(*(x[:call] for x in inputs))
         parts, found = [*zip(*(x.split(call) for x in inputs), strict=True)], list[Tensor]()
-        us = 1e6 * seconds(lambda: found.extend(solve(*x) for x in parts), clock=time.process_time)
+        us = 1e6 * seconds(lambda: found.extend(solve(*x) for x in parts))
     return torch.cat(found), us / len(inputs[0])
 
 

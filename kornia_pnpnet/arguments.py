@@ -205,6 +205,5 @@ def in_parts(solve: Callable[[Inputs], PnPResult], inputs: Inputs, most: int | N
         results.append(result._replace(weights=weights, inliers=inliers))
         places.append(at)
         stop = start
-    whole = results[0] if len(results) == 1 else map_tensors(lambda *x: torch.cat(x), *results)
     back = torch.cat(places).argsort()
-    return map_tensors(lambda x: x[back], whole)
+    return map_tensors(lambda *x: torch.cat(x)[back], *results)

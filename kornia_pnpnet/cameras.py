@@ -212,17 +212,16 @@ def looking_along(inputs: Inputs) -> Inputs:
     """Convert bearings to a rig in which each pair has a camera whose optical axis is the bearing of the pair."""
     inputs = map_tensors(torch.Tensor.contiguous, inputs)  # see `with_undistorted`
     rotation, sound = bearing_cameras(inputs.img_points)
-    rig = inputs.rig
-    if rig is not None:  # an invalid camera makes the direction of its pair invalid
-        sound = sound & torch.cat((rig.rotation.flatten(-2), rig.translation), -1).detach().isfinite().all(-1)
-        turn, shift = sound_pose(rig, sound)
+    rig = Pose(rotation, torch.zeros_like(rotation[..., 0]))
+    if inputs.rig is not None:  # an invalid camera makes the direction of its pair invalid
+        sound = sound & torch.cat([x.flatten(2) for x in inputs.rig], 2).detach().isfinite().all(2)
+        turn, shift = sound_pose(inputs.rig, sound)
         rig = Pose(rotation @ turn, (rotation @ shift[..., None])[..., 0])
     axis = torch.where(sound[..., None], torch.zeros_like(inputs.img_points[..., :2]), torch.nan)
     # The geometric mean of fx and fy converts sigmas from pixels to radians. Skew and principal point are ignored.
     cameras, has_focal = pinholes(inputs.intrinsics.diagonal(dim1=-2, dim2=-1).diag_embed())
     focal = torch.where(has_focal, focal_length(cameras), 0.0)
     cameras = torch.stack((focal, focal, torch.ones_like(focal)), -1).diag_embed()
-    rig = Pose(rotation, torch.zeros_like(rotation[..., 0])) if rig is None else rig
     return inputs._replace(img_points=axis, intrinsics=cameras, rig=rig)
 
 

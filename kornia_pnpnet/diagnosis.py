@@ -101,13 +101,14 @@ def diagnose(
         if inputs.init is not None:
             rotation, translation = inputs.init
             inverse = Pose(rotation.mT, -(rotation.mT @ translation[..., None])[..., 0])
-            poses = map_tensors(lambda *x: torch.cat(x), Pose(rotation, translation), inverse, poses)
+            poses = map_tensors(lambda *x: torch.cat(x), inputs.init, inverse, poses)
             pairs = tuple(torch.cat((x, x, more)) for x, more in zip(given, batch, strict=True))
         trials = _judged(names, pairs, poses)
-        least = max((trial.evidence for trial in trials if trial.ok), default=0.0) - _EQUAL
-        best = tuple(trial for trial in trials if trial.ok and trial.evidence > least)
-        if best:
+        believed = [trial for trial in trials if trial.ok]
+        if believed:
             break
+    least = max((trial.evidence for trial in believed), default=0.0) - _EQUAL
+    best = tuple(trial for trial in believed if trial.evidence > least)
     # A change of the pose, or no change, is simpler than a change of the pairs.
     plain = [trial for trial in trials[: len(trials) - len(changed) + 1] if trial in best]
     return Diagnosis(trials, tuple(plain[:1]) or best)

@@ -198,9 +198,9 @@ def export_package(
     """Compile a solver ahead of time with AOTInductor. See :func:`export_program` for the arguments and their errors.
 
     :func:`load_package` loads the package without tracing or compiling. C++ programs need only libtorch to load a
-    package. A package runs on one thread. A package needs the compiling machine's PyTorch version, and a CPU that has
-    all of this machine's instruction sets (for example AVX-512). Compiling takes minutes. An existing file is replaced
-    only when the package is complete.
+    package. A package runs on one thread, except for matrix products. A package needs the compiling machine's PyTorch
+    version, and a CPU that has all of this machine's instruction sets (for example AVX-512). Compiling takes minutes.
+    An existing file is replaced only when the package is complete.
 
     A package for ``batch=1`` and a fixed number of pairs solves one problem in a fraction of the time of other
     packages. With PyTorch's own loader, a call of such a package overwrites the previous result of the same thread.

@@ -17,7 +17,7 @@ from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Noise, Problem, Starts
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose, Status, sound_pose
 
-__all__ = ["F_CONST", "Frame", "Normalize", "focal_length", "scaled_cameras"]
+__all__ = ["F_CONST", "Frame", "Normalize", "focal_length", "may_be_confidence", "scaled_cameras"]
 
 #: Focal length of the normalised camera in pixels. (Cameras of ETH3D have focal lengths of 3400 to 3430.)
 F_CONST = 3400.0
@@ -175,13 +175,12 @@ class Normalize(Configured):
             confidence: see :class:`~kornia_pnpnet.problem.Problem`. Pairs with a value outside [0, 1] are left out.
             rig: see :class:`~kornia_pnpnet.problem.Problem`.
         """
-        (batch, count), left_out = world_points.shape[:2], None
+        (batch, count), ignored = world_points.shape[:2], None
         if confidence is not None:
             named = torch.ones_like(confidence, dtype=torch.bool) if mask is None else mask
             named = named if weights is None else named & (weights != 0)
-            is_probability = (confidence > -_ROUNDING) & (confidence < 1.0 + _ROUNDING)
-            mask = named & (is_probability | confidence.isnan())
-            left_out = named & ~mask
+            mask = named & may_be_confidence(confidence)
+            ignored = torch.where((named & ~mask).any(-1), Status.CONFIDENCE.value, Status.SOLVED.value)
             confidence = torch.where(mask, confidence.clamp(0.0, 1.0), torch.nan)
         padded = weights is not None or mask is not None
         if weights is None:
@@ -247,14 +246,13 @@ class Normalize(Configured):
             sound = (values.abs() < _LARGEST_ENTRY).all(-1)  # (B, N)
             is_finite = is_finite & (sound | ~given.mT).all(-1)
             rig = sound_pose(rig, sound)
+            rig = Pose(rig.rotation, rig.translation / size[:, None, None])
         status = torch.where(spread_out, Status.PRECISION.value, Status.DEGENERATE.value)
         status = status.masked_fill(is_precise, Status.SOLVED.value)
         status = status.masked_fill(number < MIN_PAIRS, Status.CAMERA.value)  # camera invalid or not fitting the pixels
         if padded:
             status = status.masked_fill(given.sum(0) < MIN_PAIRS, Status.TOO_FEW_PAIRS.value)
-        ignored = None
-        if left_out is not None:
-            ignored = torch.where(left_out.any(-1), Status.CONFIDENCE.value, Status.SOLVED.value)
+        if ignored is not None:
             status = torch.where(status == Status.TOO_FEW_PAIRS.value, ignored.maximum(status), status)
         status = torch.where(is_finite, status, Status.NOT_FINITE.value)
         valid = status == Status.SOLVED.value
@@ -293,12 +291,15 @@ class Normalize(Configured):
                 world_cov = world_cov.divided(size[:, None])
             sigmas = scaled(noise.img, img_scale.mT.reciprocal()), scaled(noise.world, size[:, None])
             noise = Noise(*sigmas, img_cov, world_cov)
-        if rig is not None:
-            rig = Pose(rig.rotation, rig.translation / size[:, None, None])
         if order is not None:
             noise, confidence, rig = pairs_at((noise, confidence, rig), order)
         scales = mean_scale, size.reciprocal(), is_usual.mT
         return Problem(world_points, img_points, weights[..., 0], focal, *scales, noise, confidence, rig), frame
+
+
+def may_be_confidence(values: Tensor) -> Tensor:
+    """Whether values are probabilities, up to rounding, or NaN (unknown)."""
+    return (values > -_ROUNDING) & (values < 1.0 + _ROUNDING) | values.isnan()
 
 
 def focal_length(camera: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import TypeCheckError, ValueCheckError
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
@@ -19,7 +18,6 @@ from kornia_pnpnet.core.performance import full_precision
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import Inputs, Problem, Starts, State
-from kornia_pnpnet.refine.kernels import KERNELS
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.refine.residual import covariance_at, information, normal_equations, project, retract, tangent
 from kornia_pnpnet.result import Pose
@@ -116,7 +114,6 @@ def monte_carlo_pose_loss(
     check_whole(0, rounds=rounds)
     check_whole(count, samples=samples)
     check_positive(scale=scale)
-    KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
     if img_sigma is None and img_cov is None:
         raise ValueCheckError("monte_carlo_pose_loss needs the noise of the pixels: img_sigma or img_cov.")
     noisy_points = world_sigma is not None or world_cov is not None

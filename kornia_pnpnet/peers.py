@@ -136,9 +136,9 @@ class PeerSolver(nn.Module):
         inliers, ok = torch.zeros_like(used), torch.zeros_like(pinhole)
         rows = (status == Status.NOT_BELIEVED).nonzero()[:, 0].tolist()
         arrays = [(world[i, used[i]].numpy(), img[i, used[i]].numpy(), cameras[i].numpy()) for i in rows]
-        start = time.process_time()
+        start = time.perf_counter()
         answers = [self.solve_one(*one) for one in arrays]
-        self.library_s = time.process_time() - start
+        self.library_s = time.perf_counter() - start
         for i, found in zip(rows, answers, strict=True):
             if found is not None:
                 both = np.stack([np.column_stack(x) for x in (found[:2], found.init or found[:2])])
@@ -409,6 +409,7 @@ class PyColmap(RobustPeer):
         camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=intrinsics[_PINHOLE])
         ransac = {"max_error": self.threshold, "confidence": self.confidence, "random_seed": self.seed}
         ransac |= {"min_num_trials": self.min_iterations, "max_num_trials": self.max_iterations}
+        ransac |= {"min_inlier_ratio": 0.0}  # the default, 0.1, would limit the number of trials further
         options = {"ransac": ransac}, {"loss_function_scale": self.loss_scale}
         found = pycolmap.estimate_and_refine_absolute_pose(img_points, world_points, camera, *options)
         if found is None:

@@ -36,7 +36,7 @@ _LARGEST_CONFIG = 2**20
 # `layers` has a lower limit.
 _SMALL = 1000
 # Options that are lengths or scales, but not sizes of tensors.
-_LENGTHS = ("f_const", "img_scale", "max_error", "robustness", "world_scale")
+_LENGTHS = ("algebraic_weight", "f_const", "img_scale", "max_error", "robustness", "world_scale")
 
 
 def shipped_weights() -> list[str]:

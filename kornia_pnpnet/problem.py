@@ -16,12 +16,26 @@ from kornia_pnpnet.core.symmetric import Symmetric2, Symmetric3
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.result import Pose, PosePrior
 
-__all__ = ["LEAST_NOISE", "MIN_PAIRS", "Hypotheses", "Inputs", "Linear", "Noise", "Problem", "Starts", "State", "Term"]
+__all__ = [
+    "LEAST_DEPTH",
+    "LEAST_NOISE",
+    "MIN_PAIRS",
+    "Hypotheses",
+    "Inputs",
+    "Linear",
+    "Noise",
+    "Problem",
+    "Starts",
+    "State",
+    "Term",
+]
 
 #: Least standard deviation of a pixel, in focal lengths. This bound keeps the weights of exact pixels finite.
 LEAST_NOISE = 1e-6
 #: Least number of pairs that determine a pose up to a few solutions.
 MIN_PAIRS = 3
+#: Least depth, in units of the normalised world, at which the noise of points is converted to pixels.
+LEAST_DEPTH = 0.5
 
 
 class State(NamedTuple):
@@ -203,21 +217,19 @@ class Problem(NamedTuple):
 
     @property
     def places(self) -> Tensor:
-        """The pixel of each pair, :math:`(B, N, 2)`. In a rig, the ray of each pair, :math:`(B, N, 3)`."""
-        return self.img_points if self.rig is None else self.rays(self.img_points / self.focal)
+        """The pixel of each pair, (B, N, 2); in a rig, its ray of length ``focal`` in the rig's frame, (B, N, 3)."""
+        if self.rig is None:
+            return self.img_points
+        plane_points = self.img_points / self.focal
+        rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
+        rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
+        return (self.rig.rotation * rays[..., None]).sum(-2)
 
     @property
     def centres(self) -> Tensor:
         """The centre of each pair's camera in the frame of the rig, :math:`(B, N, 3)`."""
         assert self.rig is not None
         return -(self.rig.rotation * self.rig.translation[..., None]).sum(-2)
-
-    def rays(self, plane_points: Tensor) -> Tensor:
-        """Rays (B, N, 3) of length ``focal``, in the rig's frame, through points on the cameras' planes z = 1."""
-        assert self.rig is not None
-        rays = torch.cat((plane_points, torch.ones_like(plane_points[..., :1])), -1)
-        rays = self.focal * torch.nn.functional.normalize(rays, dim=-1)
-        return (self.rig.rotation * rays[..., None]).sum(-2)
 
     def seen_with(self, zoom: Tensor) -> Problem:
         """The same pairs with the known focal length ``focal * exp(zoom)``. ``zoom`` has the shape (B, 1) or (B, 0)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -39,8 +40,8 @@ from kornia_pnpnet.result import Alternatives, PnPResult, Pose, PosePrior, Statu
 
 __all__ = ["PnPNet"]
 
-# Gradients of a problem's loss with respect to normalised inputs are limited to this norm. Usual norms are about 1.
-_LONGEST_GRADIENT = 10.0
+# Limits the gradients of a problem's loss with respect to normalised inputs to this norm. Usual norms are about 1.
+_bounded = partial(bound_gradient, limit=10.0)
 # Number of additional iterations of the refinement if the focal length starts from a nominal value (see `_with_camera`)
 # or distortion is estimated. With 1000 pairs, fewer iterations do not converge (CameraProblems, seeds 4321 and 4322).
 # With `m = 0`, only these iterations give the distortion a gradient.
@@ -219,9 +220,10 @@ class PnPNet(PretrainedMixin):
                 need not be calibrated.
             prior: a prior of the pose, such as :func:`~kornia_pnpnet.refine.terms.gravity_prior`. The prior adds a
                 term to the cost, and thus affects the refinement and the choice of the best pose. Unless ``init`` is
-                given or the focal length is unknown, the refinement also starts from the prior's pose. ``ok`` and
-                ``probability`` depend on the pairs alone. If neither call nor initialiser gives the noise, the noise of
-                pixels is assumed to be one pixel, at most 0.01 radians.
+                given or the focal length is unknown, the refinement also starts from the prior's pose. The
+                evidence for a pose comes from the pairs alone, but ``probability`` compares the pose with rivals by
+                pairs and prior. If neither call nor initialiser gives the noise, the noise of pixels is assumed to be
+                one pixel, at most 0.01 radians.
             dist: 4, 5, 8, 12 or 14 distortion coefficients, as in Kornia and OpenCV, shape :math:`(B, D)` or
                 :math:`(D,)`. Pixels and their noise are undistorted once before solving. Pairs whose pixel cannot be
                 undistorted are left out.
@@ -251,12 +253,7 @@ class PnPNet(PretrainedMixin):
                 or with ``alternatives``, or when neither the solver nor the call gives a start for a rig.
         """
         size, inputs = checked_inputs(
-            world_points,
-            img_points,
-            intrinsics,
-            weights,
-            mask,
-            init,
+            *(world_points, img_points, intrinsics, weights, mask, init),
             img_sigma=img_sigma,
             world_sigma=world_sigma,
             img_cov=img_cov,
@@ -286,7 +283,7 @@ class PnPNet(PretrainedMixin):
         if rig:
             result = result._replace(intrinsics=given_cameras(intrinsics, size, result.translation))
         if not (call.always or first_stage_only):
-            self._watch.see(result.ok, *inputs[:4])
+            self._watch.see(result.ok, *iter_tensors(inputs))
         return result
 
     if TYPE_CHECKING:  # nn.Module.__call__ accepts and returns Any
@@ -305,8 +302,7 @@ class PnPNet(PretrainedMixin):
         rig = self._is_rig(inputs, options.get("dist"), options.get("fisheye"))
         with in_full_precision(inputs.world_points.device.type):
             call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always")
-            inputs, nominal = self._with_camera(inputs)
-            attempt = self._attempt(inputs, call, nominal=nominal)
+            attempt = self._attempt(inputs, call)
             starts = attempt.frame.undo_starts(attempt.starts, attempt.problem.focal)
             result, starts = restore_leading(size, (attempt.result, starts))
             if rig:
@@ -343,8 +339,7 @@ class PnPNet(PretrainedMixin):
         self._run, self._whole = Runner(not whole, mode), Runner(whole, mode)
 
     def _solve(self, inputs: Inputs, call: _Call) -> PnPResult:
-        inputs, nominal = self._with_camera(inputs)
-        attempt = self._attempt(inputs, call, nominal=nominal)
+        attempt = self._attempt(inputs, call)
         return self._with_alternatives(attempt, call.alternatives) if call.alternatives else attempt.result
 
     def _with_camera(self, inputs: Inputs) -> tuple[Inputs, bool]:
@@ -361,8 +356,9 @@ class PnPNet(PretrainedMixin):
         searched = self.radial or not trait(self.init, "finds_focal")
         return (with_found_focal(inputs, self.radial) if searched else inputs), False
 
-    def _attempt(self, inputs: Inputs, call: _Call, *, nominal: bool = False) -> _Attempt:
-        """Propose poses, refine them, and judge the best pose. ``nominal``: whether the focal length is nominal."""
+    def _attempt(self, inputs: Inputs, call: _Call) -> _Attempt:
+        """Propose poses, refine them, and judge the best pose."""
+        inputs, nominal = self._with_camera(inputs)
         fixed = call.first_stage_only or self.effort == "fixed"
         watched = *iter_tensors(inputs), *(self.parameters() if needs_graph(()) else ())  # vmap can be over parameters
         free = not (fixed or self._whole.compiled) and sees_values(*watched)
@@ -380,8 +376,7 @@ class PnPNet(PretrainedMixin):
         if inputs.radial is not None:
             seen = distorted(problem, inputs.radial)
             zoom = torch.zeros_like(inputs.radial[:, :1]) if starts.camera is None else starts.camera[:, :1]
-            camera = torch.cat((zoom, inputs.radial), 1)
-            starts = starts._replace(camera=camera)
+            starts = starts._replace(camera=torch.cat((zoom, inputs.radial), 1))
         plan = self._run(self.refine.begin, seen, starts)
         more = _MORE_ITERATIONS if (nominal or self.radial) and not call.first_stage_only else 0
         plan, now = self.refine.iterate(plan, 0 if call.first_stage_only else None, more=more, run=self._run)
@@ -401,11 +396,12 @@ class PnPNet(PretrainedMixin):
         problem, frame = self.normalize(*inputs[:5], inputs.noise, inputs.confidence, inputs.rig)
         init = inputs.init
         if call.always:
-            inner = (*problem[:3], problem.noise, problem.rig)
-            world, img, weights, noise, rig = map_tensors(lambda x: bound_gradient(x, _LONGEST_GRADIENT), inner)
-            problem = problem._replace(world_points=world, img_points=img, weights=weights, noise=noise, rig=rig)
+            names = "world_points", "img_points", "weights", "noise", "confidence", "rig"
+            inner = map_tensors(_bounded, [getattr(problem, name) for name in names])
+            problem = problem._replace(**dict(zip(names, inner, strict=True)))
         if inputs.prior is not None:
             term, usable = PoseTerm.of(inputs.prior, frame.centroid, frame.size)
+            term = map_tensors(_bounded, term) if call.always else term
             problem, init = problem._replace(pose_terms=(term,)), inputs.prior.pose if init is None else init
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
         if inputs.free_focal is not None:
@@ -423,6 +419,7 @@ class PnPNet(PretrainedMixin):
         views = 1 if call.first_stage_only or self.refine.m == 0 else self.views
         fixed, order = self.effort == "fixed" or self._whole.compiled, self.normalize.order
         starts = propose(self.init, problem, given, views=views, order=order, fixed=fixed, search_follows=searches)
+        problem = problem._replace(img_scale=frame.img_scale)  # the threshold of RANSAC was in undistorted pixels
         return problem, frame, starts
 
     def _result(self, problem: Problem, frame: Frame, starts: Starts, refined: Refinement, call: _Call) -> PnPResult:

@@ -186,6 +186,7 @@ def are_rotations(matrices):
     finite(matrices)
     flat = matrices.detach().double().reshape(-1, 3, 3)
     torch.testing.assert_close(flat @ flat.mT, torch.eye(3).double().expand_as(flat), rtol=0, atol=1e-4)
+    assert (torch.linalg.det(flat) > 0).all()
 
 
 #: Numbers for options: sound ones, and those that make no sense.

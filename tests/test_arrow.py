@@ -195,8 +195,8 @@ def test_results_of_shards_are_those_of_the_tables_and_not_taken_for_those_of_an
     for i, problems in enumerate(drawn):
         assert parquet.read_table(out / f"part{i}.parquet") == SOLVE(table_of(problems))
     other, option = Solve("pnpnet-n9"), Solve("reppnp", reject_outliers=False)
-    camera = Solve(SOLVE.solver, intrinsics=torch.eye(3))
-    for solve, name in ((other, "pnpnet-n9"), (other, "reppnp"), (option, "reppnp"), (camera, "reppnp")):
+    camera, focal = Solve(SOLVE.solver, intrinsics=torch.eye(3)), Solve("reppnp", focal="unknown")
+    for solve, name in ((other, "pnpnet-n9"), *((x, "reppnp") for x in (other, option, camera, focal))):
         with pytest.raises(InputError, match=name):
             solve_shards(solve, [folder], out, name=name)
     assert solve_shards(other, [folder], out, name="pnpnet-n9", overwrite=True).shards == 3

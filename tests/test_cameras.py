@@ -12,7 +12,16 @@ from kornia.geometry.linalg import inverse_transformation, transform_points
 from laws import distorted
 from torch.nn import functional
 
-from kornia_pnpnet import PnPNet, Pose, create_solver, monte_carlo_pose_loss, pose_covariance, pose_errors, solve_pnp
+from kornia_pnpnet import (
+    PnPNet,
+    Pose,
+    PosePrior,
+    create_solver,
+    monte_carlo_pose_loss,
+    pose_covariance,
+    pose_errors,
+    solve_pnp,
+)
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.data import CameraProblems
@@ -135,6 +144,22 @@ def test_sigma_is_that_of_the_pixels_of_a_fisheye(name, uniform, generator):
     assert (shown / given).median().item() == pytest.approx(1.0, abs=0.2)
 
 
+def test_a_prior_is_weighed_against_a_pixel_of_the_fisheye(uniform, generator):
+    """60 degrees off the axis, the lens scale is 3.06: a camera with a shorter focal length has the same pixels."""
+    around, depth = uniform(50, 40, 1, high=math.pi), uniform(50, 40, 1, low=2.0, high=6.0)
+    across = torch.cat((around.cos(), around.sin()), -1) * uniform(50, 40, 1).sign()
+    points = depth * torch.cat((math.sin(math.radians(60.0)) * across, torch.full_like(depth, 0.5)), -1)
+    pixels = 400.0 * math.radians(60.0) * across + torch.randn(50, 40, 2, generator=generator, dtype=torch.float64)
+    angle, short = pixels.norm(dim=-1, keepdim=True) / 400.0, 400.0 / 3.06
+    eye, one = torch.eye(6, dtype=torch.float64).expand(50, 6, 6), torch.ones(50, dtype=torch.float64)
+    shift = 0.1 * torch.stack((one, 0.0 * one, 0.0 * one), -1)
+    prior, solver = PosePrior(Pose(eye[:, :3, :3], shift), 1e4 * eye, math.inf * one), create_solver("epnp-lm")
+    camera, shorter = (torch.diag(torch.tensor([f, f, 1.0], dtype=torch.float64)) for f in (400.0, short))
+    found = solver(points, pixels, camera, fisheye=0.0 * FISHEYE, prior=prior)
+    expected = solver(points, short * angle.tan() / angle * pixels / 400.0, shorter, prior=prior)
+    torch.testing.assert_close(found.translation, expected.translation, rtol=0, atol=2e-3)
+
+
 @pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
 def test_covariances_and_losses_of_negative_focal_lengths(signs, make_problems):
     p, flip = make_problems(batch=3, outliers=2), torch.tensor([*signs, 1.0], dtype=torch.float64)
@@ -254,6 +279,11 @@ def test_what_cannot_be_combined_is_refused():
         (lambda: solver(points, pixels, None), "intrinsics"),
         (lambda: create_solver("epnp", focal="unknown").with_starts(points, pixels, CAMERA, dist=dist), "unknown"),
         (lambda: bearings(pixels.expand(2, 2, -1, -1), CAMERA.expand(2, 3, 3)), "intrinsics"),
+        (lambda: solver(points, pixels, CAMERA, torch.ones(2, 8, 2)), "not for each of u and v"),
+        (lambda: solver(points, pixels, CAMERA, init=torch.eye(4)), "init must be a Pose"),
+        (lambda: solver(points, pixels, CAMERA, prior=p.pose), "prior must be a PosePrior"),
+        (lambda: solver(points, pixels, CAMERA, world_sigma=0.1, world_cov=torch.zeros(2, 8, 3, 3)), "world_sigma or"),
+        (lambda: create_solver("opencv-epnp", views=2), "views: for solvers of this package only"),
     ):
         with pytest.raises(BaseError, match=match):
             call()

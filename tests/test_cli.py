@@ -241,6 +241,8 @@ SOLVE, EVALUATE = f"solve pairs.csv --intrinsics {CAMERA}", "evaluate --problems
         (f"{SOLVE} --focal 0.1 --diagnose", "--diagnose needs a known focal length"),
         *((f"{SOLVE} --batch {option}", "not for --batch") for option in ("--json", "--plot x.png")),
         ("solve pairs.csv pairs.csv", "--batch"),
+        *((f"{SOLVE} --plot x.txt", "a .pdf, .png or .svg file"), (f"{SOLVE} --plot mine.png", "--overwrite")),
+        *((f"{SOLVE} --out x", "--out need --batch"), ("export x.onnx --pairs 6,9", "one number of pairs")),
         (f"{SOLVE} --focal unknown --solver poselib", "does not estimate focal lengths"),
         *((f"{SOLVE} --solver {name}", name) for name in ("nobody", "tests")),
         *((f"{SOLVE} --solver opencv-ransac:{option}=no", option) for option in ("speed", "refine")),
@@ -248,7 +250,8 @@ SOLVE, EVALUATE = f"solve pairs.csv --intrinsics {CAMERA}", "evaluate --problems
         *((f"solve {path} --intrinsics {CAMERA}", f"{path}: ") for path in ("missing.csv", "sub")),
         *((f"{EVALUATE} --{option} nowhere", "nowhere") for option in ("data", "solver")),
         *((f"{EVALUATE} --outliers none,{word}", repr(word)) for word in ("some", "", "120%", "x%")),
-        *((f"{EVALUATE} --n {n}", why) for n, why in (("9,", "--n"), ("9,2", "2"), ("20,6 --outliers 7", "n = 6"))),
+        *((f"{EVALUATE} --n {n}", why) for n, why in (("9,", "--n"), ("20,6 --outliers 7", "n = 6"))),
+        (f"{EVALUATE} --n 9,2", "at least 3 pairs, got 2"),
         (f"{EVALUATE} --solver known-inliers:threshold=3", "threshold"),
         *((f"export {name}", ".pt2") for name in ("model", "model.pt", "model.so", ".onnx")),
         ("export x.onnx --solver opencv-ransac", "opencv-ransac belongs to another library"),
@@ -257,7 +260,7 @@ SOLVE, EVALUATE = f"solve pairs.csv --intrinsics {CAMERA}", "evaluate --problems
 )
 def test_bad_arguments(csv_file, tmp_path, monkeypatch, arguments, culprit):
     (tmp_path / "sub").mkdir()
-    before = {"mine.onnx": "mine", "mine.pt2": "mine", "pairs.csv": csv_file.read_text()}
+    before = {"mine.onnx": "mine", "mine.pt2": "mine", "mine.png": "mine", "pairs.csv": csv_file.read_text()}
     for name, content in before.items():
         (tmp_path / name).write_text(content)
     monkeypatch.chdir(tmp_path)

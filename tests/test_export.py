@@ -133,19 +133,22 @@ def test_onnx_of_an_unknown_focal_length(tmp_path):
         torch.testing.assert_close(torch.from_numpy(camera), solver(*inputs).intrinsics, rtol=1e-3, atol=1e-3)
 
 
-#: Solver, its options, and those of the export.
-REFUSED = [("p3p-ransac", {}, {"n": 9}), ("pnpnet-n9", {}, {"n": 8}), ("identity-lm", {}, {"rig": True})]
-REFUSED += [("identity-lm", {}, {"n": n}) for n in (2, True, 6.0, math.nan, "6")]
-REFUSED += [("identity-lm", {}, {"n": 9, "batch": batch}) for batch in (0, True, 0.5, "1")]
-REFUSED += [(name, {"focal": "unknown"}, {}) for name in ("p3p-ransac", "epnp-lm")]
-REFUSED += [("pnpnet-set", {"focal": "unknown", "radial": 1}, {}), ("pnpnet-set", {"focal": "unknown"}, {"rig": True})]
+#: Solver, its options, those of the export, and the error.
+REFUSED = [("p3p-ransac", {}, {"n": 9}, "RANSAC cannot"), ("pnpnet-n9", {}, {"n": 8}, "built for n = 9")]
+REFUSED += [("identity-lm", {}, {"rig": True}, "For rigs")]
+REFUSED += [("identity-lm", {}, {"n": n}, "n must be an integer of at least 3") for n in (2, True, 6.0, math.nan, "6")]
+REFUSED += [("identity-lm", {}, {"n": 9, "batch": batch}, "batch must be") for batch in (0, True, 0.5, "1")]
+REFUSED += [("p3p-ransac", {"focal": "unknown"}, {}, "RANSAC cannot")]
+REFUSED += [("epnp-lm", {"focal": "unknown"}, {}, "With an unknown focal")]
+REFUSED += [("pnpnet-set", {"focal": "unknown", "radial": 1}, {}, "With an unknown focal")]
+REFUSED += [("pnpnet-set", {"focal": "unknown"}, {"rig": True}, "For rigs")]
 
 
-@pytest.mark.parametrize(("name", "chosen", "options"), REFUSED)
-def test_what_cannot_be_exported_leaves_the_old_file(name, chosen, options, tmp_path):
+@pytest.mark.parametrize(("name", "chosen", "options", "why"), REFUSED)
+def test_what_cannot_be_exported_leaves_the_old_file(name, chosen, options, why, tmp_path):
     for export, path in ((export_onnx, tmp_path / "old.onnx"), (export_package, tmp_path / "old.pt2")):
         path.write_bytes(b"old")
-        with pytest.raises(BaseError):
+        with pytest.raises(BaseError, match=why):
             export(create_solver(name, **chosen), path, **options)
         assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 2

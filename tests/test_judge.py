@@ -10,7 +10,7 @@ from doubtful import INTRINSICS, doubtful
 from kornia.core.exceptions import BaseError
 from kornia.geometry.linalg import transform_points
 
-from kornia_pnpnet import PnPNet, Pose, Status, create_solver, diagnose, p3p, pose_errors, success
+from kornia_pnpnet import PnPNet, Pose, Status, create_solver, diagnose, gravity_prior, p3p, pose_errors, success
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.data.draws import random_poses
 from kornia_pnpnet.judge.evidence import LAW, LEAST_PROBABILITY, Votes, _leave_a_line, at_pose, evidence, pose_sigma
@@ -278,6 +278,16 @@ def test_the_solutions_of_three_pairs(make_problems):
     assert (seen | ~valid).double().mean() > 0.95
 
 
+def test_gravity_chooses_between_mirror_images(generator):
+    *given, pose = boards(generator, batch=300, tilt=40.0, sigma=1.0)
+    down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand(300, 3)
+    prior = gravity_prior(down, (pose.rotation @ down[..., None])[..., 0], 0.05)
+    result = create_solver("pnpnet-set")(*given, prior=prior, img_sigma=1.0, world_sigma=0.0)
+    close = pose_errors(result.pose, pose).rotation_error_deg < 10.0
+    assert close.double().mean() > 0.98
+    assert result.ok[close].double().mean() > 0.9
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_none_where_the_pairs_say_enough(name, make_problems):
     problems = make_problems(n=50, batch=20)
@@ -294,6 +304,7 @@ def test_padding_bad_problems_and_gradients(generator):
     whole = solver(world, img, camera, alternatives=2)
     padded = [torch.nn.functional.pad(x, (0, 0, 0, 3)) for x in (world, img)]
     masked = solver(*padded, camera, mask=(torch.arange(12) < 9).expand(6, 12), alternatives=2)
+    assert whole.alternatives.valid[:, 0].any()
     broken = img.clone()
     broken[1, 0, 0] = torch.nan
     bad = solver(world, broken, camera, alternatives=2)
@@ -308,6 +319,7 @@ def test_padding_bad_problems_and_gradients(generator):
         result = solver(world, pixels, camera, alternatives=alternatives)
         gradients.append(torch.autograd.grad(result.translation.sum(), pixels)[0])
     assert torch.equal(*gradients)
+    assert gradients[0].any()
     assert not result.alternatives.rotation.requires_grad
 
 

@@ -203,7 +203,7 @@ covariance = partial(k.pose_covariance, POSES, POINTS, PIXELS, CAMERA)
 likelihood = partial(k.monte_carlo_pose_loss, POSES, POSES, world_points=POINTS, img_points=PIXELS, intrinsics=CAMERA)
 #: Calls with a wrong argument of the functions beside the solvers.
 WRONG = [partial(bearings, x, CAMERA) for x in (PIXELS[..., :1], torch.zeros(2, 5, 3), PIXELS[0, 0])]
-WRONG += [partial(bearings, PIXELS, CAMERA.expand(5, 3, 3)), partial(bearings, PIXELS[0], CAMERA[None])]
+WRONG += [partial(bearings, PIXELS[0], CAMERA[None])]
 WRONG += [partial(bearings, PIXELS, CAMERA, dist=torch.zeros(5, 4)), partial(lifted, img_points=torch.zeros(2, 5, 3))]
 WRONG += [partial(bearings, PIXELS[0], CAMERA, fisheye=torch.zeros(1, 4))]
 WRONG += [partial(lifted, img_sigma=1.0, img_cov=torch.zeros(2, 5, 2, 2))]
@@ -221,6 +221,9 @@ WRONG += [partial(pose_distances, POSES, POSES, torch.zeros(3)), partial(k.diagn
 WRONG += [partial(k.pose_errors, k.Pose(*x), POSES) for x in ((CAMERA[None], ZEROS), (CAMERA, ZEROS[0]))]
 WRONG += [partial(pose_distances, k.Pose(CAMERA.expand(2, 3, 3), ZEROS[:1]), POSES)]
 WRONG += [partial(likelihood, img_sigma=1.0, **x) for x in ({"kernel": "wide"}, {"samples": 3})]
+WRONG += [partial(likelihood, img_sigma=1.0, **x) for x in ({"scale": 0.0}, {"rounds": -1})]
+WRONG += [partial(k.monte_carlo_pose_loss, POSES, 3, POINTS, PIXELS, CAMERA, img_sigma=1.0)]
+WRONG += [partial(covariance, focal=x, focal_sigma=y, img_sigma=1.0) for x, y in (("free", None), ("unknown", 0.0))]
 WRONG += [partial(likelihood, world_points=torch.ones(3, 5, 3), img_points=torch.zeros(3, 5, 2), img_sigma=1.0)]
 WRONG += [partial(likelihood, img_sigma=1.0, img_cov=torch.zeros(2, 5, 2, 2)), partial(covariance, world_sigma=0.1)]
 WRONG += [partial(covariance, img_sigma=1.0, world_sigma=0.1, world_cov=torch.zeros(2, 5, 3, 3)), likelihood]

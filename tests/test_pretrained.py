@@ -99,9 +99,6 @@ def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, 
     write_weights(tmp_path, config, state)
     with pytest.raises(ValueCheckError, match=rf"{name} is {value}, too large"):
         PnPNet.from_pretrained(tmp_path)
-    write_weights(tmp_path, config, {**state, "pair.bias": torch.full((4,), torch.nan)})
-    with pytest.raises(ValueCheckError, match=r"not finite: pair\.bias"):
-        PnPNet.from_pretrained(tmp_path)
 
 
 def test_a_solver_that_could_not_be_loaded_is_not_saved(tmp_path):
@@ -112,6 +109,10 @@ def test_a_solver_that_could_not_be_loaded_is_not_saved(tmp_path):
     with pytest.raises(ValueCheckError, match="not finite"):
         solver.save_pretrained(tmp_path)
     assert not any(tmp_path.iterdir())
+    config, state = read_weights("pnpnet-set")
+    write_weights(tmp_path, config, {**state, "pair.bias": torch.full((4,), torch.nan)})
+    with pytest.raises(ValueCheckError, match=r"not finite: pair\.bias"):
+        PnPNet.from_pretrained(tmp_path)
 
 
 def test_loading_draws_no_random_numbers():

@@ -20,7 +20,7 @@ from kornia_pnpnet.propose.p3p import P3P, p3p
 from kornia_pnpnet.propose.p3p_rig import P3PRig
 from kornia_pnpnet.propose.ransac import RANSAC
 from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, draw, samples_needed
-from kornia_pnpnet.propose.scoring import SCORERS, Scene, as_entries, as_pose
+from kornia_pnpnet.propose.scoring import SCORERS, Scene, as_entries
 from kornia_pnpnet.propose.search import Search
 from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm
@@ -389,14 +389,15 @@ def test_the_gradient_is_that_of_the_result(make_problems, generator):
 
 
 def test_rivals_are_more_accurate_if_the_noise_exceeds_the_threshold():
-    noise = {"img_sigma": 6.0, "world_sigma": 0.0, "outliers": OutlierMix(count=12)}
+    noise = {"img_sigma": 6.0, "world_sigma": 0.0, "outliers": OutlierMix(count=12), "dtype": torch.float64}
     problems = SyntheticProblems(n=40, batch_size=100, seed=3, **noise).batch(0)
     ransac = RANSAC(P3P(), threshold=3.0)
     problem, frame = PnPNet(ransac, RobustWeightedLM(m=0)).normalize(*problems[:3])
     limit = 3.0 * problem.img_scale[:, None]
     search = Search(ransac, problem, Thresholds(limit, torch.zeros_like(limit)), finds_rivals=True)
     search.run()
-    poses = [frame.undo(as_pose(x)) for x in (search.poses, search.rivals)]
+    poses = [frame.undo(search.states(x).pose) for x in (search.poses, search.rivals)]
+    assert_close(poses[1].rotation @ poses[1].rotation.mT, torch.eye(3).double().expand(100, 3, 3), rtol=0, atol=1e-12)
     best, rival = (pose_errors(pose, problems.pose).rotation_error_deg.median() for pose in poses)
     assert rival < 0.9 * best
 

@@ -37,7 +37,8 @@ cluster = Cluster(initialize_head=True, head_node_args={{"num_cpus": 1}})
 cluster.add_node(num_cpus=1)
 ray.init(address=cluster.address, log_to_driver=False)
 options = dict(zip(("source", "out", "id_column"), sys.argv[1:]))
-ray_data.solve(solver="pnpnet-n9", workers=2, batch={BATCH}, function=Watched, **options)
+ray_data.Solve = Watched
+ray_data.solve(solver="pnpnet-n9", workers=2, batch={BATCH}, **options)
 ray.shutdown()
 cluster.shutdown()
 """

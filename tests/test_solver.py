@@ -1,5 +1,6 @@
 """What the laws of ``laws.py`` do not say of solvers: effort, confidence, gradients, given poses, saving and views."""
 
+import math
 import os
 import re
 from functools import partial
@@ -15,10 +16,12 @@ from torch.utils.data import DataLoader, default_collate
 
 import kornia_pnpnet as k
 from kornia_pnpnet import MLPInit, Normalize, PnPNet, Pose, RobustWeightedLM, Status, create_solver
+from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.pretrained import shipped_weights
+from kornia_pnpnet.propose.epnp import EPnP
 
 
 def hard_problems(count=30):
@@ -145,6 +148,11 @@ def test_a_step_against_the_gradient_lowers_the_loss_of_problems_that_are_not_ok
         rotation, translation = pose_distances(result.pose, p.pose)
         return rotation + translation / p.pose.translation.norm(dim=1)
 
+    confidence = torch.full((128, 12), 0.5).requires_grad_()
+    found = solver(p.world_points, pixels.detach(), p.intrinsics, confidence=confidence)
+    if name == "pnpnet-set":  # the only solver whose network sees confidences
+        (gradient,) = torch.autograd.grad(1e9 * found.translation.sum(), confidence)
+        assert (gradient.norm(dim=1) < 11.0).all()
     before = losses(pixels)
     (gradient,) = torch.autograd.grad(before.sum(), pixels)
     step = 0.1 * gradient / gradient.flatten(1).norm(dim=1)[:, None, None]  # pixels
@@ -167,6 +175,11 @@ def test_a_training_without_a_gradient_warns_once(make_problems, generator):
     solver = create_solver("pnpnet-set", effort="fixed")
     for pixels in (wrong, right, *[wrong] * 8):
         solver(p.world_points, pixels, p.intrinsics)
+    solver, rays = create_solver("pnpnet-set", effort="fixed"), bearings(wrong.detach(), p.intrinsics)
+    for _ in range(7):
+        solver(p.world_points, rays.requires_grad_(), p.intrinsics)
+    with pytest.warns(RuntimeWarning, match="monte_carlo_pose_loss"):
+        solver(p.world_points, rays, p.intrinsics)
 
 
 @pytest.mark.parametrize(
@@ -182,9 +195,24 @@ def test_a_given_pose_helps_and_does_no_harm(name, make_problems, perturb):
     assert (result.matrix - p.pose.matrix).norm() < 0.1 * (close.matrix - p.pose.matrix).norm()
 
 
+@pytest.mark.parametrize(("name", "options"), [("p3p-ransac", {"max_samples": 1}), ("epnp-lm", {}), ("pnpnet-n9", {})])
+def test_a_given_pose_competes_with_those_of_the_initialiser(name, options, make_problems, perturb):
+    p = make_problems(batch=100, outliers=3, noise=False, max_angle=math.pi)
+    near, solver = perturb(p.pose, angle=1e-4, shift=1e-3), create_solver(name, **options)
+    alone, given = (rate(solver(*p[:3], init=x), p) for x in (None, near))
+    assert given > alone + 0.2
+
+
+def test_a_given_pose_competes_even_if_the_pairs_are_too_few_for_a_sample(make_problems):
+    p = make_problems(batch=20, noise=False)
+    given = {"mask": (torch.arange(9) < 5).expand(20, 9), "init": p.pose}
+    assert_same(create_solver("ransac-epnp-lm")(*p[:3], **given).matrix, p.pose.matrix, atol=1e-5)
+
+
+@pytest.mark.parametrize("focal", ["known", "unknown"])
 @pytest.mark.parametrize("name", ["pnpnet-set", "p3p-ransac"])
-def test_a_pair_is_left_out_if_its_confidence_is_no_probability(name, make_problems, generator):
-    p, solver = make_problems(12), create_solver(name)
+def test_a_pair_is_left_out_if_its_confidence_is_no_probability(name, focal, make_problems, generator):
+    p, solver = make_problems(12), create_solver(name, focal=focal)
     confidence = torch.rand(7, 12, generator=generator, dtype=torch.float64)
     weights = torch.ones_like(confidence)
 
@@ -243,6 +271,7 @@ def saved_net():
 
 
 SAVED = [saved_net, lambda: PnPNet(None, RobustWeightedLM(m=2, step=np.float32(0.9)), gradient="always")]
+SAVED += [lambda: PnPNet(EPnP(algebraic_weight=2000), RobustWeightedLM(m=2))]
 SAVED += [lambda: create_solver("epnp-lm", m=2, focal="unknown", focal_sigma=np.float32(0.1), radial=1)]
 SAVED += [lambda: create_solver("pnpnet-set", effort="fixed", views=2)]
 SAVED += [type("Sub", (PnPNet,), {"__init__": lambda self, *a, **x: PnPNet.__init__(self, *a, **x)})]  # noqa: PLW0108
@@ -318,7 +347,7 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
 
 NAMES = "identity-lm", "p3p-ransac", "pnpnet-n9", "poselib"
 WRONG = [("pnpnet-nine", {}, r"pnpnet-nine.*identity-lm"), (["epnp"], {}, "epnp"), (None, {}, "None")]
-WRONG += [("pnpnet-n9", {"m": -1}, "m must"), ("epnp-lm", {"effort": "adaptive"}, "effort")]
+WRONG += [("pnpnet-n9", {"m": -1}, "m must")]
 WRONG += [(name, {"iterations": 3}, r"options: got .* 'iterations'\.$") for name in NAMES]
 CONFIGS = {"six": {"init": {"name": "MLPInit", "n": "six"}}, "Oracle": {"init": {"name": "Oracle"}}}
 CONFIGS |= {"refine": {"refine": None}, "tukey": {"refine": {"kernel": "tukey"}}, "colour": {"colour": "red"}}

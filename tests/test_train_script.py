@@ -124,7 +124,7 @@ def test_run_starts_from_weights(tmp_path, train):
     (tmp_path / "mine" / "results.json").write_text('{"overrides": [1]}')
     damaged = f"weights={tmp_path / 'mine'}", r"is not a results file of a run: overrides\[0\] is 1"
     centre = "model.solver.normalize.center=false", "inputs of the networks differ: center"
-    for wrong, why in (("model.n=6", ""), ("weights=nowhere", ""), centre, damaged):
+    for wrong, why in (("model.n=6", "size mismatch"), ("weights=nowhere", "No weights 'nowhere'"), centre, damaged):
         with pytest.raises(SystemExit, match=f"Cannot start.*{why}"):
             train(f"hydra.run.dir={tmp_path}/wrong", *options, wrong)
     assert not (tmp_path / "wrong" / "last.ckpt").exists()
@@ -154,6 +154,12 @@ def test_data_of_ones_own_and_any_validation_sets(tmp_path, monkeypatch, train):
     assert "board/rate" in (tmp_path / "sweep" / "summary.csv").read_text()
     with pytest.raises(SystemExit, match=r"data\.validation is empty"):
         train(*away, f"hydra.run.dir={tmp_path}/none")
+
+
+def test_two_runs_of_a_sweep_never_share_a_folder(tmp_path, train):
+    with pytest.raises(SystemExit):
+        train("-m", "model.m=2,5", "weights=../../w/a", f"hydra.sweep.dir={tmp_path}")
+    assert list(tmp_path.rglob("*.ckpt")) == []
 
 
 @pytest.mark.slow

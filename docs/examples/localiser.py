@@ -99,12 +99,10 @@ class DiskLightGlue:
         self.matcher = LightGlueMatcher("disk")
 
     def detect(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """See Sift."""
         found = self.network(image, self.count, pad_if_not_divisible=True)[0]
         return laf_from_center_scale_ori(found.keypoints[None]), found.descriptors
 
     def match(self, query: Photo, reference: Photo) -> tuple[Tensor, Tensor]:
-        """See Sift."""
         lafs = query.lafs, reference.lafs
         scores, pairs = self.matcher(query.descriptors, reference.descriptors, *lafs, query.shape, reference.shape)
         return scores[:, 0], pairs

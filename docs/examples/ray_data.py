@@ -22,24 +22,15 @@ from kornia_pnpnet.arrow import Solve
 BLOCK = 2**25
 
 
-def solve(
-    source: str,
-    out: str,
-    solver: str,
-    *,
-    workers: int,
-    batch: int = 10_000,
-    id_column: str | None = None,
-    function: type[Solve] = Solve,
-) -> None:
-    """Solve problems of Parquet files, with the options of the command; ``function`` is the class of the workers."""
+def solve(source: str, out: str, solver: str, *, workers: int, batch: int, id_column: str | None = None) -> None:
+    """Solve problems of Parquet files, with the options of the command."""
     context = DataContext.get_current()
     context.target_max_block_size = BLOCK
     if id_column:
         place = out.rstrip("/") if "://" in out else os.path.abspath(out)  # a checkpoint takes no relative path
         context.checkpoint_config = CheckpointConfig(id_column, f"{place}.done", delete_checkpoint_on_success=False)
     poses = ray.data.read_parquet(source).map_batches(
-        function,
+        Solve,
         fn_constructor_kwargs={"solver": solver},
         batch_format="pyarrow",
         batch_size=batch,

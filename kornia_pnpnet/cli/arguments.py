@@ -102,7 +102,7 @@ SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; reprojection errors then refer to un
 _FOCAL = "unknown: estimate the focal length; SIGMA: improve the given one, which has this relative error, such as 0.1"
 _THRESHOLD = "reject correspondences with a larger reprojection error; default: reject all but the solver's inliers"
 _SOLVERS = """names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or folders
-of weights; solvers for another n are skipped; default: all installed solvers for these n, and the bounds"""
+of weights; solvers for another n are skipped; default: the usual installed solvers for these n, and the bounds"""
 _DATA = f"{', '.join(SYNTHETIC)}, a folder with a COLMAP model, or an .npz file of matches; default: synthetic"
 _OUTLIERS = "none, uniform (0 to n/3 per problem), numbers or shares like 50%%, separated by commas"
 _MISMATCHES = "every outlier gets the pixel of another point; default: half of them, the others get random pixels"

@@ -38,9 +38,9 @@ def run(_: argparse.Namespace) -> int:
     for name in list_solvers():
         package = missing_package(name)
         missing = f" (needs {package}: {how_to_install('eval')})" if package else ""
-        states[name] = _WHAT.get(max(filter(name.startswith, _WHAT), key=len, default=""), "") + missing
+        states[name] = _WHAT[max(filter(name.startswith, _WHAT), key=len)] + missing
     states |= dict.fromkeys(BOUNDS, "bound: needs the true pose, for `pnpnet evaluate` only")
     for name, state in states.items():
         print(f"{name:<{max(map(len, states))}}  {state}")
-    print(f"\nShipped weights: {', '.join(shipped_weights()) or 'none'}")
+    print(f"\nShipped weights: {', '.join(shipped_weights())}")
     return 0

@@ -47,7 +47,6 @@ def solve_shards(
     name: str,
     batch: int = 10_000,
     overwrite: bool = False,
-    progress: bool = False,
 ) -> ShardReport:
     r"""Solve shards of problems one after the other. The results of the shard ``part.*`` go to ``part.parquet``.
 
@@ -57,6 +56,7 @@ def solve_shards(
     have the shape (), (B,) or (B, N).
 
     A results file appears only when it is complete. A repeated call skips shards that have results.
+    On a terminal, a bar shows the progress.
 
     Args:
         solve: the solver.
@@ -65,7 +65,6 @@ def solve_shards(
         name: name of the solver. Results files store this name and a digest of weights, options and intrinsics.
         batch: largest number of problems that are solved at once. Parquet shards are also read in such parts.
         overwrite: also solve the shards that have results.
-        progress: show a progress bar if stderr is a terminal.
 
     Raises:
         InputError: when there is no shard, when two shards would have results of the same name, when ``out`` is the
@@ -87,7 +86,7 @@ def solve_shards(
     for target in waiting:  # after an interruption, the same command without --overwrite must not keep old results
         target.unlink(missing_ok=True)
     counts, failed = np.zeros(2, int), []
-    with _bar(waiting.values(), progress) as bar:
+    with _bar(waiting.values()) as bar:
         for target, shard in waiting.items():
             try:
                 counts += _solve_shard(solve, shard, target, mark, batch, bar)
@@ -124,15 +123,14 @@ def _solver_of(target: Path) -> bytes | None:
     return None
 
 
-def _bar(shards: Iterable[Path], shown: bool) -> Any:
-    """Make a progress bar that counts problems. If ``shown`` is false, the bar prints nothing."""
+def _bar(shards: Iterable[Path]) -> Any:
+    """Make a progress bar that counts problems. Without a terminal, the bar prints nothing."""
     from tqdm import tqdm
 
     total = None  # the total is unknown with NPZ files and with files that cannot be read
     with suppress(OSError, pa.ArrowException):
-        total = sum(parquet.read_metadata(shard).num_rows for shard in shards if shown)
-    disable = None if shown else True  # None: no bar without a terminal
-    return tqdm(total=total, unit="problem", unit_scale=True, disable=disable)
+        total = sum(parquet.read_metadata(shard).num_rows for shard in shards)
+    return tqdm(total=total, unit="problem", unit_scale=True, disable=None)
 
 
 def _solve_shard(solve: Solve, shard: Path, target: Path, mark: bytes, batch: int, bar: Any) -> tuple[int, int]:

@@ -83,7 +83,7 @@ def _solve_batch(arguments: argparse.Namespace, camera: Tensor | None) -> int:
     out, again, name = arguments.out or "outputs/poses", arguments.overwrite, arguments.solver
     solve, size = Solve(_load_solver(arguments), intrinsics=camera), arguments.batch_size
     try:
-        report = solve_shards(solve, arguments.file, out, name=name, batch=size, overwrite=again, progress=True)
+        report = solve_shards(solve, arguments.file, out, name=name, batch=size, overwrite=again)
     except KeyboardInterrupt:
         same = "the same command without --overwrite" if again else "the same command"
         print(f"pnpnet: interrupted; the shards solved so far are in {out}: {same} solves the others", file=sys.stderr)

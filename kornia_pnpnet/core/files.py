@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import os
+import uuid
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,7 +41,7 @@ def atomic_open(path: str | Path, mode: str = "w", **options: Any) -> Iterator[I
         number = errno.EISDIR if path.is_dir() else errno.EINVAL
         raise OSError(number, os.strerror(number), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # readers of a folder of tables skip hidden files
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # readers of tables skip hidden files
     try:
         with temporary.open(mode, **options) as file:
             yield file

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn import functional
 
 from kornia_pnpnet.core.performance import are_few, compiling, exporting, records
 
@@ -67,6 +68,12 @@ def gate(value: Tensor, live: Tensor, finite: Tensor, fill: float | Tensor) -> T
     if torch.is_grad_enabled() or forward_ad._current_level >= 0:  # forward mode works in `no_grad`, too
         value = torch.where(live.view(shape), value, value.detach())
     return torch.where(finite.view(shape), value, fill).contiguous()
+
+
+def half_turn(axis: Tensor) -> Tensor:
+    """Rotations (*, 3, 3) by 180 degrees about axes (*, 3) of any length."""
+    axis = functional.normalize(axis, dim=-1)
+    return 2.0 * axis[..., :, None] * axis[..., None, :] - torch.eye(3, dtype=axis.dtype, device=axis.device)
 
 
 def lengths(vectors: Tensor) -> Tensor:

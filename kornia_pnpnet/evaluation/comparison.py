@@ -22,7 +22,7 @@ from kornia_pnpnet.data.stream import ProblemSource
 from kornia_pnpnet.evaluation.results import FORMAT, resume, row_errors, save_results, source_digest
 from kornia_pnpnet.metrics import pose_errors, success, success_rate
 from kornia_pnpnet.peers import PeerSolver
-from kornia_pnpnet.result import PnPResult, Pose, Problems, gate_pose
+from kornia_pnpnet.result import PnPResult, Pose, Problems, sound_pose
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = ["EvaluationData", "SeesTruth", "draw_problems", "evaluate"]
@@ -101,7 +101,7 @@ def evaluate(
 
         The row of a set and a solver has ``success`` (rate, low, high, total), ``rotation_error_deg`` and
         ``translation_error`` (quartiles), ``ok`` (share), ``us_per_problem`` (median of the timed calls; for a peer the
-        processor time of the library alone), ``per_problem`` (errors and ok) and possibly ``environment`` (entries that
+        time of the library alone), ``per_problem`` (errors and ok) and possibly ``environment`` (entries that
         differ from the file's entries).
 
     Raises:
@@ -201,11 +201,11 @@ def _measure(solver: nn.Module, entry: EvaluationData, chunk: int, repeats: int)
     found = [(result.pose, result.ok) for result, _ in calls[: len(chunks)]]
     pose, ok = map_tensors(lambda *parts: torch.cat(parts), *found)
     pose, truth = map_tensors(lambda part: part.double().cpu(), (pose, problems.pose))
-    finite = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
+    finite = pose.matrix.isfinite().all((1, 2))
     ok = ok.cpu() & finite
-    pose = gate_pose(pose, finite, finite)
+    pose = sound_pose(pose, finite)
     # Solvers return the identity if they find no pose. This must not be a success where the true pose is the identity.
-    none = ~ok & (pose.matrix == torch.eye(4).to(pose.rotation)).flatten(1).all(-1)
+    none = ~ok & (pose.matrix == torch.eye(4).to(pose.rotation)).all((1, 2))
     rotation = torch.where(none[:, None, None], pose.rotation.new_tensor(_NO_ROTATION), pose.rotation)
     errors = pose_errors(Pose(rotation, pose.translation), truth)
 

@@ -39,7 +39,6 @@ class _ProblemSet(TypedDict):
 class _Results(TypedDict):
     __pydantic_config__ = STRICT  # type: ignore[misc]
     format: Literal[1]
-    kind: NotRequired[Literal["evaluation"]]
     environment: dict[str, Any]
     solvers: dict[str, dict[str, Any]]
     data: dict[str, _ProblemSet]

@@ -246,8 +246,7 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
     for _ in range(_ROUNDS):
         share = share * (chances / torch.addcmul(outlier, share, more)).sum(-1, keepdim=True)
         share = share.clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
-    terms = (torch.addcmul(outlier, share, more) / outlier).log()
-    terms = votes.pairs * terms
+    terms = votes.pairs * (torch.addcmul(outlier, share, more) / outlier).log()
     # Three points fit any pose. If they were detected repeatedly, all of their pairs do.
     by_point = torch.zeros_like(terms).scatter_add(-1, votes.points.expand_as(terms), terms)
     fitted = by_point.topk(MIN_PAIRS, -1).values.clamp(min=0.0).sum(-1, keepdim=True)
@@ -261,7 +260,7 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
     least = torch.where(best[0] > 0, _STEP**-0.5 * variance, torch.finfo(share.dtype).eps ** 2 * variance)
     mixture = Mixture(variance, share, least, total)
     for _ in range(_FINAL_ROUNDS):
-        mixture = updated(mixture, seen, votes)
+        mixture = updated(mixture, seen, votes, votes.known)
     inlier, _, outlier = mixture.densities(exponent, outliers)
     inlier = inlier / (inlier + outlier) * there
     chances = votes.pairs * inlier
@@ -282,11 +281,8 @@ def at_pose(state: State, problem: Problem, votes: Votes) -> AtPose:
 
 
 @torch.no_grad()
-def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None = None) -> Mixture:
-    """Run one round of EM. Problems that are ``frozen``, bool (B, 1), keep their variance.
-
-    ``frozen=None``: problems are frozen if the caller gave their noise.
-    """
+def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor) -> Mixture:
+    """Run one round of EM. Problems that are ``frozen``, bool (B, 1), keep their variance."""
     exponent = seen.exponent.detach()
     inlier, weighted, outlier = mixture.densities(exponent, seen.outlier.detach())
     chances = votes.pairs / (inlier + outlier)
@@ -294,7 +290,7 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor | None 
     squares = (chances * weighted * exponent).sum(-1, keepdim=True)  # times -1/2
     variance = (squares / (0.5 * seen.unknowns - inliers).clamp(max=-0.5)).maximum(mixture.least)
     return mixture._replace(
-        variance=torch.where(votes.known if frozen is None else frozen, mixture.variance, variance),
+        variance=torch.where(frozen, mixture.variance, variance),
         share=(inliers / mixture.total).clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE),
     )
 

@@ -6,9 +6,8 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from kornia_pnpnet.core.linalg import eigenvectors
+from kornia_pnpnet.core.linalg import eigenvectors, half_turn
 from kornia_pnpnet.core.performance import problems_last, repeat_problems
 from kornia_pnpnet.core.trees import map_tensors, put, take
 from kornia_pnpnet.judge.evidence import FAR_TURN, Evidence
@@ -105,26 +104,20 @@ def reconsider(
     now: Progress,
     found: Evidence,
     valid: Tensor,
-    rival: State | None = None,
-    replaced: Tensor | None = None,
+    rival: State | None,
+    replaced: Tensor | None,
 ) -> tuple[Progress, Evidence, Tensor]:
     """Compare refined poses with rivals. If ``refine.by_residual`` is positive, each problem keeps its likeliest pose.
 
-    If the noise is unknown and a larger noise is almost as likely, a rival starts from the refined pose and the larger
-    noise. If the mirror image of the pose has small residuals, a rival starts from the mirror image. If ``replaced`` is
-    ``None``, a given rival is ignored when its rotation is close to the refined rotation, or when nearly all pairs are
-    inliers. A given rival starts with the noise of its own residuals. If ``refine.by_residual`` is 0, only mirror
-    images and rivals of ``replaced`` are tried. Rivals that end over 10 degrees from the result lower its probability.
+    The prior of a pose counts for its likelihood. If the noise is unknown and a larger noise is almost as likely, a
+    rival starts from the refined pose and the larger noise. If the mirror image of the pose has small residuals, a
+    rival starts from the mirror image. If ``replaced`` is ``None``, a given rival is ignored when its rotation is close
+    to the refined rotation, or when nearly all pairs are inliers. A given rival starts with the noise of its own
+    residuals. If ``refine.by_residual`` is 0, only mirror images and rivals of ``replaced`` are tried. Rivals that end
+    over 10 degrees from the result lower its probability.
 
-    Args:
-        refine: the refiner.
-        plan: the plan of the refinement.
-        now: the refined poses.
-        found: the evidence for the refined poses.
-        valid: whether a problem is valid, bool, shape :math:`(B,)`.
-        rival: given rivals, for example of ``search_on``, or ``None``. A rival that equals the refined pose is ignored.
-        replaced: whether the given rival replaces the refined pose, bool, shape :math:`(B,)`. Given rivals that do not
-            replace a pose are ignored. ``None``: given rivals compete by their likelihoods.
+    ``found`` is the evidence for the refined poses ``now``. A given ``rival`` that equals the refined pose is ignored.
+    Where ``replaced``, bool (B,), is true, the given rival replaces the refined pose; elsewhere it is ignored.
 
     Returns:
         The arguments of :meth:`~kornia_pnpnet.refine.lm.RobustWeightedLM.judge`: the states, the evidence for the
@@ -170,7 +163,11 @@ def reconsider(
     likelihood[0] = found.likelihood
     if replaced is not None:
         likelihood[0].masked_fill_(replaced, torch.finfo(likelihood.dtype).min)
-    likelihood[kind, owners] = of_ends.likelihood.nan_to_num(-torch.inf)
+    likelihood[kind, owners] = of_ends.likelihood
+    for mine, its in zip(problem.pose_terms, every.problem.pose_terms, strict=True):
+        likelihood[0] -= 0.5 * mine.loss(now.state)
+        likelihood[kind, owners] -= 0.5 * its.loss(tried.state)
+    likelihood[kind, owners] = likelihood[kind, owners].nan_to_num(-torch.inf)
     end[kind, owners] = torch.arange(len(owners), device=owners.device)
     best = likelihood.argmax(0)
     rows = best.nonzero()[:, 0]
@@ -213,13 +210,8 @@ def _mirrored(pose: Pose, problem: Problem, shares: Tensor) -> Pose:
         normal = eigenvectors(covariance.permute(1, 2, 0))[0][1].mT
     seen = torch.baddbmm(pose.translation[..., None], pose.rotation, middle[..., None])
     sight = seen[..., 0] if problem.rig is None else seen[..., 0] - _mean(problem.centres, shares)
-    rotation = torch.bmm(torch.bmm(_half_turn(sight), pose.rotation), _half_turn(normal))
+    rotation = torch.bmm(torch.bmm(half_turn(sight), pose.rotation), half_turn(normal))
     return Pose(rotation, torch.baddbmm(seen, rotation, middle[..., None], alpha=-1)[..., 0])
-
-
-def _half_turn(axis: Tensor) -> Tensor:
-    axis = functional.normalize(axis, dim=-1)
-    return 2.0 * axis[:, :, None] * axis[:, None] - torch.eye(3, dtype=axis.dtype, device=axis.device)
 
 
 def _of_three(problem: Problem, weights: Tensor, fallback: Pose) -> tuple[Tensor, ...]:

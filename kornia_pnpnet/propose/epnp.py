@@ -58,6 +58,7 @@ class ControlPoints(NamedTuple):
     coordinates: Tensor  # the world points are `coordinates @ points`; the last column of planar points is 0, (B, N, 4)
     weights: Tensor  # normalised to the sum 1, (B, N)
     planar: Tensor  # whether the points lie in a plane or on a line, bool, (B,)
+    radius: Tensor  # root mean square distance of the points from the centroid; 1 if they lie on a line, (B,)
     ok: Tensor  # whether the points do not lie on a line, bool, (B,)
 
 
@@ -95,7 +96,8 @@ def control_points(problem: Problem) -> ControlPoints:
         found.append(there)
         limit = torch.where(there, (largest.detach() * ratio**2).maximum(limit), torch.inf)
     points, coordinates = torch.stack(vectors, 1).permute(2, 1, 0), torch.stack(axes).permute(2, 1, 0)
-    return ControlPoints(points, coordinates, weights.mT, ~found[2], found[1])
+    radius = torch.where(found[1], points[:, 1:].square().sum((1, 2)), 1.0).sqrt()
+    return ControlPoints(points, coordinates, weights.mT, ~found[2], radius, found[1])
 
 
 class EPnP(Initialiser):
@@ -209,12 +211,10 @@ def _depth_system(control: ControlPoints, problem: Problem, weight: float) -> _D
     eye = torch.eye(4, dtype=weights.dtype, device=weights.device)
     maps = torch.cat((moments, eye.expand(moments.shape[0], 4, 4)), 1)
     maps = maps.permute(1, 2, 0).unflatten(0, (3, 4)).contiguous()
-    mean_square = control.points[:, 1:].square().sum((1, 2))
-    unit = torch.where(control.ok, mean_square, 1.0).sqrt()
-    vectors = control.points[:, 1:].permute(2, 1, 0) / unit
+    vectors = control.points[:, 1:].permute(2, 1, 0) / control.radius
     gram = small_product(vectors.transpose(0, 1), vectors)[:, :, None]
     coordinates, plane_points = (x.permute(1, 2, 0).contiguous() for x in (coordinates, plane_points))
-    known = coordinates, control.weights.mT, plane_points, unit, vectors, gram
+    known = coordinates, control.weights.mT, plane_points, control.radius, vectors, gram
     return _DepthSystem(*known, maps[..., None, :], error, weight * error[:, :, None])
 
 

@@ -37,10 +37,10 @@ def propose(
     problem: Problem,
     given: Pose | None,
     *,
-    views: int = 1,
-    order: bool = True,
-    fixed: bool = False,
-    search_follows: bool = False,
+    views: int,
+    order: bool,
+    fixed: bool,
+    search_follows: bool,
 ) -> Starts:
     """Propose the poses from which refinement starts.
 

@@ -12,10 +12,11 @@ from kornia_pnpnet.cameras import pinholes, with_undistorted
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import ranked
 from kornia_pnpnet.core.trees import map_tensors, put, take
-from kornia_pnpnet.frame import F_CONST, Normalize, focal_length
+from kornia_pnpnet.frame import F_CONST, Normalize, focal_length, may_be_confidence
 from kornia_pnpnet.problem import MIN_PAIRS, Inputs, Problem, State
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.ransac import RANSAC
+from kornia_pnpnet.propose.scoring import as_entries
 from kornia_pnpnet.propose.search import CAUCHY, cauchy_scale, least_squares
 from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.refine.terms import CameraTerm
@@ -46,7 +47,7 @@ _WIDE = 0.07
 _SHRINK, _LEAST = 0.6, 1e-5
 
 
-def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> Inputs:
+def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int) -> Inputs:
     """Replace each focal length by the middle of the searched range, and describe this range in ``free_focal``.
 
     If ``sigma`` (the standard deviation of log f) is given, the range lies around the caller's focal length. Otherwise
@@ -64,6 +65,7 @@ def with_nominal_focal(inputs: Inputs, sigma: float | None, radial: int = 0) -> 
             there = away < torch.inf  # NaN compares false
             for given_pairs in (inputs.mask, inputs.weights):
                 there = there if given_pairs is None else there & (given_pairs > 0)
+            there = there if inputs.confidence is None else there & may_be_confidence(inputs.confidence)
             median = ranked(torch.where(there, away, torch.inf).mT[None], (there.sum(1) - 1) // 2)[0]
             half = (_HALF_WIDTH * median).maximum(principal_point[:, 0].abs().amax(-1))
             half = torch.where(half.isfinite() & (half > 0), half, 1.0)
@@ -83,14 +85,13 @@ def scale_focal(intrinsics: Tensor, factor: Tensor) -> Tensor:
     return intrinsics * functional.pad(factor[:, None, None].expand(-1, 2, 2), (0, 1, 0, 1), value=1.0)
 
 
-def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
+def with_found_focal(inputs: Inputs, radial: int) -> Inputs:
     """Estimate the focal lengths. If the caller gave no poses, also estimate the poses.
 
     RANSAC tries P3P at the focal lengths of a grid. Least squares on the inliers improve pose and focal length. If
     ``radial`` is not 0, distortion is also estimated and removed. ``inputs`` come from :func:`with_nominal_focal`.
     """
     normalize, known = Normalize(order=False), inputs.free_focal
-    assert known is not None
     with torch.no_grad():
         problem, frame = normalize(*inputs[:5], confidence=inputs.confidence)
         one = torch.ones_like(problem.img_scale)
@@ -113,7 +114,7 @@ def with_found_focal(inputs: Inputs, radial: int = 0) -> Inputs:
         inputs = with_undistorted(inputs, as_dist(camera[:, 1:]), None)
         inputs = inputs._replace(radial=camera[:, 1:], lens_scale=None)  # the refinement distorts the pixels again
     if inputs.init is not None:  # a given pose that is not finite is ignored
-        sound = torch.cat((inputs.init.rotation.flatten(1), inputs.init.translation), 1).isfinite().all(1)
+        sound = as_entries(inputs.init).isfinite().all(-1)
         pose = map_tensors(lambda x, y: torch.where(sound.view(-1, *(1,) * (x.ndim - 1)), x, y), inputs.init, pose)
     return inputs._replace(init=pose)
 
@@ -136,7 +137,6 @@ def find_focal(problem: Problem, state: State, doubted: Tensor) -> tuple[State, 
 
 def _zoomed(inputs: Inputs, zoom: Tensor) -> Inputs:
     """Multiply the focal lengths of the inputs by the exponential of ``zoom`` (B,)."""
-    assert inputs.free_focal is not None
     known = inputs.free_focal._replace(focal=inputs.free_focal.focal * zoom.exp())
     return inputs._replace(intrinsics=scale_focal(inputs.intrinsics, zoom.exp()), free_focal=known)
 

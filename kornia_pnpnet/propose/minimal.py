@@ -12,6 +12,7 @@ from kornia_pnpnet.core.performance import ascending_order
 from kornia_pnpnet.core.trees import map_tensors, pairs_at
 from kornia_pnpnet.problem import Hypotheses, Problem
 from kornia_pnpnet.propose.initialiser import trait
+from kornia_pnpnet.propose.scoring import as_entries
 from kornia_pnpnet.refine.lm import RobustWeightedLM
 from kornia_pnpnet.result import gate_pose
 
@@ -65,7 +66,7 @@ class SubsetSolver(Configured):
             problem = pairs_at(problem, ascending_order(problem.img_points.permute(2, 1, 0)))
         starts = self.init(problem)
         pose = starts.pose if self.refine is None else self.refine(problem, starts).pose
-        valid = pose.rotation.isfinite().flatten(1).all(-1) & pose.translation.isfinite().all(-1)
+        valid = as_entries(pose).isfinite().all(-1)
         pose = gate_pose(pose, valid, valid)
         valid = valid if starts.ok is None else valid & starts.ok
         return Hypotheses(map_tensors(lambda x: x[:, None], pose), valid[:, None])

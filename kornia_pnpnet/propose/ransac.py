@@ -11,15 +11,15 @@ from kornia_pnpnet.core.checks import check_numbers, check_positive, check_whole
 from kornia_pnpnet.core.linalg import relative
 from kornia_pnpnet.core.performance import compiling, problems_last, sees_values
 from kornia_pnpnet.core.trees import map_tensors, put, take
-from kornia_pnpnet.judge.inliers import Judged, Thresholds, judge
-from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, Starts, State
+from kornia_pnpnet.judge.inliers import Thresholds, judge
+from kornia_pnpnet.problem import LEAST_DEPTH, LEAST_NOISE, MIN_PAIRS, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.minimal import MinimalSolver, describe
 from kornia_pnpnet.propose.p3p import P3P
 from kornia_pnpnet.propose.sampling import samples_needed
-from kornia_pnpnet.propose.scoring import SCORERS, Scorer, as_pose
+from kornia_pnpnet.propose.scoring import SCORERS, Scorer
 from kornia_pnpnet.propose.search import Search, are_open, cauchy_scale, least_squares
-from kornia_pnpnet.refine.residual import Projection, project
+from kornia_pnpnet.refine.residual import project
 from kornia_pnpnet.result import Pose
 
 __all__ = ["RANSAC", "search_on"]
@@ -33,9 +33,6 @@ _INLIER, _KNOWN_INLIER = 10.0, 5.0
 # the median distance of the pixels from the principal point. The number was tuned on random problems with fields of
 # view of 18 to 100 degrees (seed 6).
 _GRID_RESIDUAL = 0.04
-# `search_on` converts the noise of points to pixels at the depth of the pose. This number is the lower bound of the
-# depth, in units of the normalised world.
-_NEAREST = 0.5
 # _DOUBT is the chance that a pair of weight 0 is drawn, divided by the chance for weight 1. _LEAST_TRUST is this ratio
 # for confidences 0 and 1. _LEAST_TRUST is smaller, because confidences are more reliable than a network's weights.
 _DOUBT, _LEAST_TRUST = 0.8, 0.05
@@ -165,12 +162,12 @@ class RANSAC(Initialiser):
                 stages = [thresholds._replace(img=thresholds.img.maximum(wide[:, None])), thresholds]
             search = Search(self, fixed, stages[0], _trusted(fixed), ranks=True)
             search.run(map_tensors(lambda x: x.detach()[:, None], given))
-        projection, judged = self._refined(problems_last(problem), search.state, stages)
-        pose, camera = map_tensors(torch.Tensor.contiguous, projection.state)
-        return Starts(pose, judged.weights.contiguous(), search.loss.isfinite(), camera=camera)
+        state, weights = self._refined(problems_last(problem), search.state, stages)
+        pose, camera = map_tensors(torch.Tensor.contiguous, state)
+        return Starts(pose, weights.contiguous(), search.loss.isfinite(), camera=camera)
 
-    def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[Projection, Judged]:
-        """Improve poses on their inliers. Each stage selects the inliers once, with the thresholds of the stage."""
+    def _refined(self, problem: Problem, state: State, stages: list[Thresholds]) -> tuple[State, Tensor]:
+        """Improve poses on their inliers, and weigh the pairs. Each stage selects the inliers once."""
         projection = project(state, problem)
         for thresholds in stages:
             judged = judge(projection, problem, thresholds)
@@ -179,7 +176,7 @@ class RANSAC(Initialiser):
                 state = least_squares(problem, projection, inliers * _robust(judged.errors, inliers))
                 projection = project(state, problem)
                 judged = judge(projection, problem, thresholds)
-        return projection, map_tensors(torch.Tensor.detach, judged)
+        return state, judged.weights.detach()
 
 
 def _robust(errors: Tensor, inliers: Tensor) -> Tensor:
@@ -202,9 +199,7 @@ def _trusted(problem: Problem) -> Tensor:
 
 
 @torch.no_grad()
-def search_on(
-    problem: Problem, starts: Starts, *, keep_others: bool = False
-) -> tuple[Starts, tuple[Tensor, Pose] | None]:
+def search_on(problem: Problem, starts: Starts, *, keep_others: bool) -> tuple[Starts, tuple[Tensor, Pose] | None]:
     r"""Run RANSAC on the problems for which the poses of an initialiser do not suffice.
 
     A problem is searched only if the inliers of the last pose of the starts require over 64 samples for a confidence of
@@ -238,7 +233,7 @@ def search_on(
     if noise is None:
         raise ValueCheckError('effort="adaptive" needs an initialiser that estimates the noise, like SetInit.')
     problem = problem._replace(noise=None).map(lambda x: x.detach().contiguous())
-    depth = constant.pose.translation[:, 2:].clamp(min=_NEAREST)  # (B, 1)
+    depth = constant.pose.translation[:, 2:].clamp(min=LEAST_DEPTH)  # (B, 1)
     sigma = torch.hypot(noise.img, problem.focal * noise.world / depth).maximum(LEAST_NOISE * problem.focal)
     if known is None:
         there = (problem.weights > 0).to(sigma)
@@ -262,7 +257,7 @@ def search_on(
         some = some._replace(weights=relative(some.weights, some.weights))
         search = Search(_FURTHER, some, limits, chances, sigma, finds_rivals=True, ranks=True)
         search.run(given)
-        state, rivals = search.state, (rows, as_pose(search.rivals.to(problem.weights)))
+        state, rivals = search.state, (rows, search.states(search.rivals).pose)
         errors = judge(project(state, problems_last(some)), some, limits).errors
         pose, weights = put((pose, weights), rows, (state.pose, 1.0 / (1.0 + errors)))
     others = constant.others if keep_others else None

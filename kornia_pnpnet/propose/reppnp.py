@@ -109,12 +109,10 @@ class REPPnP(Initialiser):
         with torch.no_grad():
             control = control_points(problem)
         centroid = control.points[:, 0, :, None]
-        mean_square = control.points[:, 1:].square().sum((1, 2))
-        radius = torch.where(control.ok, mean_square, 1.0).sqrt()
         # The sum of the weights needs no gradient, because the pose does not depend on this sum.
         total = problem.weights.detach().sum(-1, keepdim=True)
         pairs = _Pairs(
-            (problem.world_points.mT - centroid) / radius[:, None, None],
+            (problem.world_points.mT - centroid) / control.radius[:, None, None],
             (problem.img_points / problem.focal).mT.contiguous(),
             problem.weights / torch.where(total > 0, total, 1.0),
             problem.weights > 0,
@@ -129,7 +127,7 @@ class REPPnP(Initialiser):
             pose = _step(pose, torch.where(ok[:, None, None], normal, 0.0))
         ok = ok & (pose.translation[:, 2] > 0)
         offset = (pose.rotation @ centroid)[..., 0]
-        pose = Pose(pose.rotation, pose.translation * radius[:, None] - offset)
+        pose = Pose(pose.rotation, pose.translation * control.radius[:, None] - offset)
         kept = (weights > 0) | (problem.usual == 0)  # the solver decides about unusual pairs
         return Starts(pose, kept.to(problem.weights.dtype), ok)
 

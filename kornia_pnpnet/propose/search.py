@@ -137,8 +137,12 @@ class Search:
 
     @property
     def state(self) -> State:
-        """The best poses and cameras in the dtype of the problem."""
-        pose, camera = self._state(self.poses.to(self.problem.weights))
+        """The best poses and cameras."""
+        return self.states(self.poses)
+
+    def states(self, poses: Tensor) -> State:
+        """Convert ``poses`` or ``rivals`` to states in the dtype of the problem, with orthonormal rotations."""
+        pose, camera = self._state(poses.to(self.problem.weights))
         # One Newton step towards the closest orthogonal matrix doubles the number of correct digits.
         rotation = 1.5 * pose.rotation - 0.5 * pose.rotation @ (pose.rotation.mT @ pose.rotation)
         # The solution of a degenerate sample can be far from a rotation, for example if rounding makes rays equal.
@@ -153,12 +157,13 @@ class Search:
         """
         self.samples = self.plain = self._samples(self.chances)
         totals = self.samples.totals
-        active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
-        if given is not None and len(active):
-            poses = as_entries(given)[active].to(_DTYPE).mT
+        rows = (self.samples.counts >= MIN_PAIRS).nonzero()[:, 0]
+        if given is not None and len(rows):
+            poses = as_entries(given)[rows].to(_DTYPE).mT
             valid = torch.ones_like(poses[:, 0], dtype=torch.bool)
-            losses, poses = self._compared(active, take(self.scene, active), poses, valid)
-            self.loss[active], self.poses[active] = losses[:, 0], poses[..., 0]
+            losses, poses = self._compared(rows, take(self.scene, rows), poses, valid)
+            self.loss[rows], self.poses[rows] = losses[:, 0], poses[..., 0]
+        active = (self.samples.counts >= self.samples.size).nonzero()[:, 0]
         start, stop = 0, 0
         while len(active):
             if start < _PLAIN_SAMPLES <= stop and self.problem.rig is None:

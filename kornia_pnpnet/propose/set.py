@@ -15,7 +15,7 @@ from kornia_pnpnet.core.linalg import align, solve_symmetric
 from kornia_pnpnet.core.performance import are_few, compiling, present_first, problems_last, sees_values, take_pairs
 from kornia_pnpnet.core.trees import pairs_at
 from kornia_pnpnet.judge.evidence import groups, totals
-from kornia_pnpnet.problem import Noise, Problem, Starts, State
+from kornia_pnpnet.problem import LEAST_DEPTH, Noise, Problem, Starts, State
 from kornia_pnpnet.propose.initialiser import Initialiser
 from kornia_pnpnet.propose.p3p import minimal_poses
 from kornia_pnpnet.propose.sampling import ranked, spread_evenly
@@ -58,9 +58,6 @@ _JUDGED = 50.0
 _LEAST_VOTE = 0.5
 # If the minimal samples have more slots for poses than this number, a CPU removes the empty slots before scoring.
 _MANY_SLOTS = 64
-# The noise of points is converted to pixels at the depth of the pose. This number is the lower bound of the depth, in
-# units of the normalised world.
-_LEAST_DEPTH = 0.5
 # If `search_on` follows, the network sees at most this number of pairs, but the search uses all pairs. On real matches
 # and on random problems of up to 1000 pairs, limits of 32 to 96 pairs give the same success rate as no limit.
 _ENOUGH = 48
@@ -169,7 +166,7 @@ def _agreement(problem: Problem, noise: Noise, pose: Pose) -> Tensor:
 
 def _variance(noise: Noise, focal: Tensor, pose: Pose) -> Tensor:
     """Variance (B, N) of the pixels, from the noise of pixels and of points at the depth of the world's centre."""
-    depth = pose.translation[:, 2:].clamp(min=_LEAST_DEPTH)
+    depth = pose.translation[:, 2:].clamp(min=LEAST_DEPTH)
     return noise.img.square() + (focal * noise.world / depth).square()
 
 

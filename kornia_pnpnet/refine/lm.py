@@ -249,6 +249,7 @@ class RobustWeightedLM(Configured):
             for name, parameter in refine.named_parameters():
                 trained = self.get_parameter(name).detach()
                 parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
+                parameter.requires_grad = m > 0 and (self.m == 0 or self.get_parameter(name).requires_grad)
         return refine
 
     def forward(self, problem: Problem, starts: Starts) -> Refinement:

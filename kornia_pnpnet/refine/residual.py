@@ -361,7 +361,7 @@ def _plus(a: Any, b: Any) -> Any:
 
 
 def lm_step(
-    equations: NormalEquations, state: State, focal: Tensor, step: Tensor, damping: Tensor, *, additive: bool = False
+    equations: NormalEquations, state: State, focal: Tensor, step: Tensor, damping: Tensor, *, additive: bool
 ) -> tuple[State, Tensor]:
     r"""Solve the damped normal equations and move the state.
 
@@ -370,17 +370,9 @@ def lm_step(
     Source: R. Sheffer and A. Wiesel, "PnP-Net: A hybrid Perspective-n-Point Network", 2020, section 3. D. Marquardt
     (1963) proposed the damping by the diagonal.
 
-    Args:
-        equations: the normal equations at the state.
-        state: the state :math:`\beta`.
-        focal: the focal length in pixels, a scalar or of shape :math:`(B,)`.
-        step: :math:`\gamma`, a scalar.
-        damping: :math:`\lambda`, a scalar or of shape :math:`(B,)`.
-        additive: update the rotation vector additively as in the paper, instead of by the retraction.
-
-    Returns:
-        The moved state, and whether the equations could be solved, bool, shape :math:`(B,)`. If the equations could not
-        be solved, the state does not change.
+    The state :math:`\beta`, ``focal``, ``step`` :math:`\gamma` and ``damping`` :math:`\lambda` are those of B problems;
+    the last three can be scalars. With ``additive``, the rotation vector is updated as in the paper, instead of by the
+    retraction. The second result tells which equations could be solved, bool (B,). The other states do not change.
     """
     if not additive:
         delta, solved = solve_positive(equations.matrix, equations.gradient, damping)
@@ -449,17 +441,10 @@ def tangent(rotation: Tensor) -> Tensor:
 
 
 def rotation_angle(rotation_a: Tensor, rotation_b: Tensor) -> Tensor:
-    r"""Angle between two rotations.
+    r"""Angles in radians, in [0, π], between rotations :math:`(*, 3, 3)`; the result has the shape :math:`(*)`.
 
     The arctangent is accurate for small angles, unlike the arccosine. The angle is not differentiable at 0. For
     training, use :mod:`kornia_pnpnet.losses`.
-
-    Args:
-        rotation_a: shape :math:`(*, 3, 3)`.
-        rotation_b: shape :math:`(*, 3, 3)`.
-
-    Returns:
-        The angle in radians, in [0, π], shape :math:`(*)`.
 
     Example:
         >>> quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

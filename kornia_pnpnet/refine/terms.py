@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.checks import Shapes, check_devices, check_form, check_positive, check_shapes, common_dtype
-from kornia_pnpnet.core.linalg import relative
+from kornia_pnpnet.core.linalg import half_turn, relative
 from kornia_pnpnet.core.performance import compiling, full_precision
 from kornia_pnpnet.problem import Linear, State
 from kornia_pnpnet.refine.residual import NormalEquations, tangent
@@ -79,8 +79,7 @@ def gravity_prior(world_down: Tensor, cam_down: Tensor, sigma: Tensor | float) -
     least = a.detach().abs().argmin(-1, keepdim=True)
     across = torch.linalg.cross(a, torch.zeros_like(a).scatter(-1, least, 1.0))
     opposite = ((a + b).detach().square().sum(-1, keepdim=True)) < torch.finfo(b.dtype).eps
-    middle = functional.normalize(torch.where(opposite, across, a + b), dim=-1)
-    rotation = 2.0 * middle[..., :, None] * middle[..., None, :] - eye
+    rotation = half_turn(torch.where(opposite, across, a + b))
     precision = torch.as_tensor(sigma, dtype=b.dtype, device=b.device).expand(b.shape[:-1]).square().reciprocal()
     # I - b b^T as a product. If b is almost parallel to an axis, rounding makes the difference indefinite.
     turned = torch.linalg.cross(b[..., None, :], eye.expand(*b.shape, 3))

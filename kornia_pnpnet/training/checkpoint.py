@@ -59,7 +59,7 @@ class StageClock:
 
 def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
     """Write a CSV file atomically. Missing values become empty cells."""
-    with atomic_open(path, newline="") as file:
+    with atomic_open(path, newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(columns), extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
@@ -72,14 +72,14 @@ class History:
         self._path, self._columns = folder / HISTORY_NAME, columns
         rows: list[dict[str, Any]] = []
         if start and self._path.is_file():
-            with self._path.open(newline="") as file:  # a crash can cut the last row
+            with self._path.open(newline="", encoding="utf-8") as file:  # a crash can cut the last row
                 rows = [row for row in csv.DictReader(file) if None not in row.values() and int(row["update"]) <= start]
         write_csv(self._path, columns, rows)
-        self.board = SummaryWriter(folder / "tensorboard", purge_step=start + 1 if start else None)
+        self.board = SummaryWriter(folder / "tensorboard", purge_step=start + 1)
 
     def write(self, row: dict[str, float]) -> None:
         """Append a row, which must have the key ``update``."""
-        with self._path.open("a", newline="") as file:
+        with self._path.open("a", newline="", encoding="utf-8") as file:
             cells = {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
             csv.DictWriter(file, self._columns).writerow(cells)
         for key, value in row.items():
