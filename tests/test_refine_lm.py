@@ -67,8 +67,8 @@ def test_the_truth_is_found_without_noise(n, batch, update, make_problems, pertu
 
 def test_a_copy_with_other_iterations_learns_what_the_original_learns():
     trained = [RobustWeightedLM(3, **x).with_iterations(5) for x in ({}, {"learnable": False})]
-    trained += [RobustWeightedLM(0).with_iterations(5), RobustWeightedLM(5, shared=True)]
-    assert [sum(p.numel() for p in x.parameters() if p.requires_grad) for x in trained] == [15, 0, 15, 3]
+    trained += [RobustWeightedLM(0).with_iterations(5), create_solver("pnpnet-set").refine.with_iterations(5)]
+    assert [sum(p.numel() for p in x.parameters() if p.requires_grad) for x in trained] == [15, 0, 15, 0]
 
 
 def test_a_far_start_does_not_diverge(make_problems):
