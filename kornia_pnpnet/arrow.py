@@ -94,13 +94,14 @@ class Solve:
     def __call__(self, table: pa.Table) -> pa.Table:
         """Solve a table.
 
-        Missing columns, columns of equal names, and columns without effect (``mask``, ``confidence``, ``weight``) raise
-        ``ValueCheckError``. Columns without numbers raise ``TypeCheckError``.
+        Missing columns, columns of equal names, and arguments of a solver that tables cannot have (``mask``,
+        ``confidence``, ``dist``, ``fisheye``, covariances, ``cam_from_rig``) raise ``ValueCheckError``. Columns without
+        numbers raise ``TypeCheckError``.
         """
         if double := {name for name in table.column_names if table.column_names.count(name) > 1}:
             raise ValueCheckError(f"the table has several columns {', '.join(sorted(double))}")
         if refused := REFUSED & {*table.column_names}:
-            raise ValueCheckError(f"the column {min(refused)} is not read: pairs with 0 in weights are ignored")
+            raise ValueCheckError(f"the column {min(refused)} is not read; pairs with 0 in weights are ignored")
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"the table has no column {name}")

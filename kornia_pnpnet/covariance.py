@@ -15,7 +15,7 @@ from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.cameras import zoomed
 from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
-from kornia_pnpnet.frame import Normalize, focal_length
+from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Noise, State
 from kornia_pnpnet.refine.residual import information, normal_equations, pixel_variance, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
@@ -200,9 +200,7 @@ def shown_noise(
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
-    cameras = frame.intrinsics[:, None] if frame.intrinsics.ndim == 3 else frame.intrinsics
-    unit = problem.focal / focal_length(cameras)  # number of the problem's pixels per undistorted pixel, (B, 1 or N)
-    unit = (unit if inputs.lens_scale is None else unit * inputs.lens_scale).expand_as(weights)
+    unit = frame.units(problem.focal, inputs.lens_scale).expand_as(weights)
     # Variance of each pixel if only the caller's pixels, or only the points, have noise of the standard deviation 1.
     of_pixels, of_points = unit.square(), pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
     by_pixel, mean = ((weights * x).sum(1) / total for x in (of_pixels, of_points))

@@ -121,7 +121,7 @@ def _judged(names: list[str], pairs: tuple[Tensor, ...], poses: Pose) -> tuple[T
     votes = Votes.of(problem, unknown)
     seen = at_pose(State.of(frame.apply(poses)), problem, votes)
     found = evidence(seen, problem, votes)
-    ok = frame.valid & (probability(seen, problem, found, unknown) >= LEAST_PROBABILITY)
+    ok = frame.valid & (probability(seen, problem, found, votes) >= LEAST_PROBABILITY)
     sigma = found.sigma * problem.focal / frame.img_scale
     columns = found.log_ratio / problem.weights.shape[1], found.inlier.gt(0.5).to(sigma).mean(1), sigma, ok.to(sigma)
     rows = torch.stack(columns, -1).unflatten(0, (len(names), -1)).median(1).values.tolist()

@@ -78,11 +78,17 @@ class Frame(NamedTuple):
         offset = (pose.rotation * self.centroid.view(-1, *more, 1, 3)).sum(-1)
         return Pose(pose.rotation, pose.translation * self.size.view(-1, *more, 1) - offset)
 
+    def units(self, focal: Tensor, lens_scale: Tensor | None) -> Tensor:
+        """Number of the problem's pixels per pixel of the caller, (B, 1 or N), in the caller's order."""
+        unit = focal / focal_length(self.intrinsics[:, None] if self.intrinsics.ndim == 3 else self.intrinsics)
+        unit = unit if lens_scale is None else unit * lens_scale
+        return torch.where((unit > 0) & unit.isfinite(), unit, 1.0)
+
     def undo_pairs(self, values: Tensor) -> Tensor:
         """Put values :math:`(B, N)` of pairs back into the caller's order."""
         return values if self.order is None else torch.zeros_like(values).scatter(1, self.order, values)
 
-    def undo_starts(self, starts: Starts, focal: Tensor) -> Starts:
+    def undo_starts(self, starts: Starts, focal: Tensor, lens_scale: Tensor | None) -> Starts:
         """Express starts of problems with a focal length in the caller's frame, order and units.
 
         The ``ok`` of the new starts is :attr:`valid`.
@@ -90,10 +96,7 @@ class Frame(NamedTuple):
         noise = starts.noise
         if noise is not None:
             img, world = map(self.undo_pairs, noise[:2])
-            img_scale = self.img_scale[:, None]
-            if self.intrinsics.ndim > 3:  # the cameras of a rig have their own scales
-                img_scale = focal / focal_length(self.intrinsics)
-            noise = Noise(img / img_scale, world * self.size[:, None])
+            noise = Noise(img / self.units(focal, lens_scale), world * self.size[:, None])
         others = None if starts.others is None else self.undo(starts.others)
         return Starts(self.undo(starts.pose), self.undo_pairs(starts.weights), self.valid, others, noise)
 

@@ -295,15 +295,14 @@ class PnPNet(PretrainedMixin):
         """Solve a batch, and also return the starts (proposed poses, weights and noise) for training losses.
 
         For the arguments, except ``alternatives``, see :meth:`forward`. The starts are in the frame, order and units of
-        the inputs. The sigma of a distorted pixel is that of the undistorted pixel, divided by the mean scale of the
-        lens. The ``ok`` of the starts says whether the problem is valid.
+        the inputs. The ``ok`` of the starts says whether the problem is valid.
         """
         size, inputs = checked_inputs(*args, **options)
         rig = self._is_rig(inputs, options.get("dist"), options.get("fisheye"))
         with in_full_precision(inputs.world_points.device.type):
             call = _Call(first_stage_only, _checked_gradient(gradient or self.gradient) == "always")
             attempt = self._attempt(inputs, call)
-            starts = attempt.frame.undo_starts(attempt.starts, attempt.problem.focal)
+            starts = attempt.frame.undo_starts(attempt.starts, attempt.problem.focal, inputs.lens_scale)
             result, starts = restore_leading(size, (attempt.result, starts))
             if rig:
                 intrinsics = args[2] if len(args) > 2 else options["intrinsics"]
@@ -405,7 +404,8 @@ class PnPNet(PretrainedMixin):
             problem, init = problem._replace(pose_terms=(term,)), inputs.prior.pose if init is None else init
             frame = frame._replace(status=torch.where(usable, frame.status, Status.NOT_FINITE.value))
         if inputs.free_focal is not None:
-            problem = problem._replace(free_focal=inputs.free_focal.scaled(frame.img_scale))
+            known = inputs.free_focal.scaled(frame.img_scale)
+            problem = problem._replace(free_focal=map_tensors(_bounded, known) if call.always else known)
         if inputs.lens_scale is not None:  # `sigma` is the noise of distorted pixels
             there = (frame.undo_pairs(problem.weights) > 0) & (inputs.lens_scale > 0)
             mean = torch.where(there, inputs.lens_scale, 1.0).log().sum(1) / there.sum(1).clamp(min=1)
@@ -413,12 +413,18 @@ class PnPNet(PretrainedMixin):
         given = None
         if self.init is None or init is not None:
             given, usable = frame.start(init)
+            given = map_tensors(_bounded, given) if call.always else given
             if init is not None:
                 ignored = torch.zeros_like(frame.status) if frame.ignored is None else frame.ignored
                 frame = frame._replace(ignored=torch.where(usable, ignored, Status.INIT.value))
         views = 1 if call.first_stage_only or self.refine.m == 0 else self.views
         fixed, order = self.effort == "fixed" or self._whole.compiled, self.normalize.order
         starts = propose(self.init, problem, given, views=views, order=order, fixed=fixed, search_follows=searches)
+        if starts.noise is not None and (inputs.rig is not None or inputs.lens_scale is not None):
+            # The estimated noise is that of a mean pixel. The caller's pixels have different sizes here.
+            unit = (frame.units(problem.focal, inputs.lens_scale) / frame.img_scale[:, None]).detach()
+            unit = unit if frame.order is None else unit.gather(1, frame.order)
+            starts = starts._replace(noise=starts.noise._replace(img=starts.noise.img * unit))
         problem = problem._replace(img_scale=frame.img_scale)  # the threshold of RANSAC was in undistorted pixels
         return problem, frame, starts
 

@@ -188,6 +188,13 @@ def shards(tmp_path, make_problems):
     return folder, drawn
 
 
+@pytest.mark.parametrize("name", ["confidence", "dist", "img_cov", "cam_from_rig"])
+def test_columns_that_would_have_no_effect_are_refused(name, make_problems):
+    table = table_of(make_problems(n=6, batch=2, dtype=torch.float32))
+    with pytest.raises(ValueCheckError, match=f"column {name} is not read"):
+        SOLVE(table.append_column(name, pa.array([[0.0] * 4] * 2)))
+
+
 def test_results_of_shards_are_those_of_the_tables_and_not_taken_for_those_of_another_solver(shards, tmp_path):
     (folder, drawn), out = shards, tmp_path / "out"
     report = solve_shards(SOLVE, [folder], out, name="reppnp", batch=7)

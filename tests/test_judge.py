@@ -63,6 +63,18 @@ def test_copies_share_one_vote():
     assert (Votes.of(rig, twice.weights[:, :1] < 0).pairs == 1.0).all()  # of bearings: each looks elsewhere
 
 
+def test_copies_of_an_outlier_do_not_fix_the_rotation_about_a_line(generator):
+    line = torch.linspace(-1.0, 1.0, 12, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0]).double()
+    world = torch.cat((line, torch.tensor([[0.3, 0.5, 0.2]]).double().expand(3, 3))).expand(50, 15, 3)
+    pose = Pose(torch.eye(3).double().expand(50, 3, 3), torch.tensor([0.0, 0.0, 4.0]).double().expand(50, 3))
+    seen = 800.0 * world[..., :2] / (world[..., 2:] + 4.0)
+    seen = seen + 0.5 * torch.randn(50, 15, 2, generator=generator).double()
+    seen[:, 12:] = seen[:, 12:13]
+    result = create_solver("pnpnet-set")(world, seen, torch.diag(torch.tensor([800.0, 800.0, 1.0])), init=pose)
+    assert result.inliers[:, 12:].any()
+    assert not result.ok.any()
+
+
 @pytest.mark.parametrize("length", [0.3, 1.0, 10.0, 1000.0])
 def test_a_far_point_does_not_make_a_line_a_solid(length, random_rotations, generator):
     rods = torch.randn(200, 9, 3, generator=generator).double() * torch.tensor([1.0, 1e-3, 1e-3])
@@ -283,6 +295,10 @@ def test_gravity_chooses_between_mirror_images(generator):
     down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand(300, 3)
     prior = gravity_prior(down, (pose.rotation @ down[..., None])[..., 0], 0.05)
     result = create_solver("pnpnet-set")(*given, prior=prior, img_sigma=1.0, world_sigma=0.0)
+    others = create_solver("pnpnet-set")(
+        *given, prior=prior, img_sigma=1.0, world_sigma=0.0, alternatives=1
+    ).alternatives
+    assert (others.probability < 0.1).double().mean() > 0.9
     close = pose_errors(result.pose, pose).rotation_error_deg < 10.0
     assert close.double().mean() > 0.98
     assert result.ok[close].double().mean() > 0.9

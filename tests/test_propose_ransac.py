@@ -413,6 +413,14 @@ def test_only_doubtful_problems_are_searched(monkeypatch, make_problems):
         create_solver("pnpnet-set")(*make_problems(40, 4, outliers=30)[:3])
 
 
+def test_tiny_weights_beside_a_prior_count_as_zero(make_problems, perturb):
+    p, inf = make_problems(100, 20), torch.full((20,), torch.inf)
+    prior = PosePrior(perturb(p.pose, angle=0.05, shift=0.05), 1e3 * torch.eye(6).expand(20, 6, 6), inf)
+    few, solver = (torch.arange(100) < 10).double().expand(20, 100), create_solver("pnpnet-set")
+    none, tiny = (solver(*p[:3], few + x * (1.0 - few), prior=prior, img_sigma=5.0) for x in (0.0, 1e-9))
+    assert (tiny.translation - none.translation).norm(dim=1).median() < 1e-3
+
+
 @pytest.mark.parametrize("weight", [1e-30, 1e-3, 1e30])
 def test_a_prior_beside_weights_of_any_unit_does_not_decide_a_search(weight, make_problems):
     p = make_problems(60, 10, outliers=40)

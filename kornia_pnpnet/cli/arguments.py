@@ -98,7 +98,7 @@ _MATCHES = """CSV with the header X,Y,Z,u,v and optionally weight, or NPZ with w
 and optionally weights (N,) and intrinsics (3, 3)"""
 _INTRINSICS = "the camera in pixels; replaces that of an NPZ file; with --batch, for shards without intrinsics"
 _CAMERA = """a distorted camera as in COLMAP's cameras.txt, in place of --intrinsics, for example
-SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; reprojection errors then refer to undistorted pixels"""
+SIMPLE_RADIAL,1920,1080,1500,960,540,-0.02; reprojection errors and sigma then refer to undistorted pixels"""
 _FOCAL = "unknown: estimate the focal length; SIGMA: improve the given one, which has this relative error, such as 0.1"
 _THRESHOLD = "reject correspondences with a larger reprojection error; default: reject all but the solver's inliers"
 _SOLVERS = """names of `pnpnet list`, with options after a colon (opencv-ransac:threshold=12,iterations=100), or folders

@@ -18,7 +18,7 @@ from kornia_pnpnet.problem import MIN_PAIRS
 
 _COLUMNS = ("X", "Y", "Z", "u", "v")
 # Names of columns and arrays that are refused unless they are read, because users would expect an effect.
-_REFUSED = {*REFUSED, "weights", "img_sigma", "world_sigma", "dist"}
+_REFUSED = {*REFUSED, "weights", "img_sigma", "world_sigma"}
 
 
 class ImageCorrespondences(NamedTuple):

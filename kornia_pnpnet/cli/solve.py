@@ -117,6 +117,8 @@ def _solve_image(arguments: argparse.Namespace, camera: Tensor | None) -> int:
         raise ValueError(f"'{plot}' exists: pass --overwrite to replace it")
     solver, pairs, camera = _load_solver(arguments), (world_points[None], img_points[None]), camera.to(img_points)
     focal = getattr(solver, "focal", "known")
+    if arguments.camera and focal == "unknown":
+        raise ValueError("--camera needs a solver with a known focal length")
     if arguments.diagnose and focal == "unknown":
         raise ValueError("--diagnose needs a known focal length")
     used = weights > 0

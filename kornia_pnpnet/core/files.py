@@ -21,8 +21,8 @@ from torch import Tensor
 #: Largest total size in bytes that :func:`read_npz` reads. A compressed file of a few megabytes can contain gigabytes.
 MOST_BYTES = 2**31
 
-#: Names of fields of pairs that no file of problems may have, because they would have no effect.
-REFUSED = {"mask", "confidence", "weight"}
+#: Names of fields that no file of problems may have, because they would have no effect.
+REFUSED = {"mask", "confidence", "weight", "dist", "fisheye", "img_cov", "world_cov", "cam_from_rig"}
 
 
 class InputError(ValueError):

@@ -296,23 +296,23 @@ def updated(mixture: Mixture, seen: AtPose, votes: Votes, frozen: Tensor) -> Mix
 
 
 @torch.no_grad()
-def probability(seen: AtPose, problem: Problem, found: Evidence, known: Tensor, odds: Tensor | None = None) -> Tensor:
+def probability(seen: AtPose, problem: Problem, found: Evidence, votes: Votes, odds: Tensor | None = None) -> Tensor:
     """Probability (B,) of errors of at most 10 degrees (rotation) and 30 % of the points' distance (translation).
 
     The result has three factors. The first is a logistic function of the evidence. The second is :func:`within_limits`
     of :func:`pose_sigma`. The third is the logistic function of ``odds`` (B,), the log-odds of the pose against other
     poses (``None``: no other poses). The result is 0 if almost all inliers lie on a line, as far as the camera sees.
-    Implausible noise, for example of mirrored pixels, also gives 0. Where ``known`` (B, 1) is true, noise up to the
-    caller's noise is plausible, too.
+    Implausible noise, for example of mirrored pixels, also gives 0. If the caller gave noise, noise up to the caller's
+    noise is plausible, too.
     """
-    scale = found.inlier / found.mixture.variance
+    scale = votes.pairs * found.inlier / found.mixture.variance
     precision = map_tensors(lambda x: scale * x, seen.precision)
     noise = found.sigma  # the unit is a radian at the focal length of the problem
     if problem.free_focal is not None:
         noise = noise * problem.focal / seen.projection.focal
-    plausible = (noise < _MOST_NOISE) | (known & (found.mixture.variance <= 1.0))[:, 0]
+    plausible = (noise < _MOST_NOISE) | (votes.known & (found.mixture.variance <= 1.0))[:, 0]
     sigma = pose_sigma(seen.projection, problem, precision).detach()
-    usable = plausible & _leave_a_line(seen.projection, problem, found.inlier > 0.5, noise)
+    usable = plausible & _leave_a_line(seen.projection, problem, votes.pairs * (found.inlier > 0.5), noise)
     offset, by_evidence = LAW
     chance = torch.sigmoid(offset + by_evidence * found.log_ratio.clamp(*LAW_RANGE)) * within_limits(sigma)
     chance = chance if odds is None else chance * torch.sigmoid(odds)
@@ -377,14 +377,14 @@ def _form(matrix: Tensor, vector: Tensor) -> Tensor:
     return torch.where(form.isnan(), torch.inf, form)  # ONNX has no `nan_to_num` of float64
 
 
-def _leave_a_line(projection: Projection, problem: Problem, inliers: Tensor, sigma: Tensor) -> Tensor:
-    """Whether the camera sees enough points of the inliers (B, N) away from their best-fitting line, bool (B,).
+def _leave_a_line(projection: Projection, problem: Problem, votes: Tensor, sigma: Tensor) -> Tensor:
+    """Whether the camera sees enough points of the inliers away from their best-fitting line, bool (B,).
 
-    Points on a line leave one rotation free. A few outliers can determine this rotation by chance. ``sigma`` (B,) is
-    the standard deviation of a pixel in radians.
+    Points on a line leave one rotation free. A few outliers can determine this rotation by chance. ``votes`` (B, N) are
+    0 for outliers. ``sigma`` (B,) is the standard deviation of a pixel in radians.
     """
-    world, inliers = projection.rotated, inliers.mT  # (3, N, B) and (N, B)
-    weights = there = inliers.to(world.dtype)
+    world = projection.rotated  # (3, N, B)
+    weights = there = votes.mT.to(world.dtype)  # (N, B)
     number = there.sum(0)
     # If no inlier exists, or if all inliers are one point, the numbers are NaN, and the result is False.
     for _ in range(_CENTRE_ROUNDS):  # far points must not turn the first line
@@ -411,4 +411,4 @@ def _leave_a_line(projection: Projection, problem: Problem, inliers: Tensor, sig
         points = points - problem.centres.permute(2, 1, 0)
     sq_turned = torch.linalg.cross(away, points, dim=0).square().sum(0)  # `norm` is slow in this layout
     clear = sq_turned > ((_CLEARLY * sigma).clamp(min=_LEAST_OFF) * points.square().sum(0)).square()
-    return (inliers & clear).sum(0) >= (number - _FEW).clamp(1, MIN_PAIRS)
+    return (there * clear).sum(0) > (number - _FEW).clamp(1, MIN_PAIRS) - 0.5  # sums of votes are rounded

@@ -74,7 +74,10 @@ def find_alternatives(
     plans, mixture = repeat_problems((plan, now.mixture), count + 1)
     refined = refine.judge(plans, Progress.of(State.of(as_pose(ends)), mixture))
     usable = refined.in_front & refined.cost.isfinite()
-    each = ends, refined.cost, refined.evidence.likelihood, usable
+    likelihood = refined.evidence.likelihood
+    for term in plans.problem.pose_terms:
+        likelihood = likelihood - 0.5 * term.loss(refined.state)
+    each = ends, refined.cost, likelihood, usable
     ends, cost, likelihood, usable = (x.unflatten(0, (count + 1, batch)) for x in each)
     usable[count] &= _are_same(ends[1], every[0], middle)
     log_ratio = (likelihood - likelihood[0]).clamp(max=_LIKELIER)
@@ -164,7 +167,7 @@ def reconsider(
     if replaced is not None:
         likelihood[0].masked_fill_(replaced, torch.finfo(likelihood.dtype).min)
     likelihood[kind, owners] = of_ends.likelihood
-    for mine, its in zip(problem.pose_terms, every.problem.pose_terms, strict=True):
+    for mine, its in zip(problem.terms, every.problem.terms, strict=True):
         likelihood[0] -= 0.5 * mine.loss(now.state)
         likelihood[kind, owners] -= 0.5 * its.loss(tried.state)
     likelihood[kind, owners] = likelihood[kind, owners].nan_to_num(-torch.inf)

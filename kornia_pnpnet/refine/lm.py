@@ -274,9 +274,10 @@ class RobustWeightedLM(Configured):
         guided = by_residual = relative(prior, prior if problem.terms else prior.detach())
         if self.by_residual:
             prior = problem.weights
-            # Unlike the largest weight, the mean of the positive weights is differentiable.
-            mean = prior.sum(-1, keepdim=True) / (prior > 0).sum(-1, keepdim=True).clamp(min=1)
-            by_residual = prior / torch.where(mean > 0, mean, 1.0)
+            # Unlike the largest weight, this mean is differentiable. Tiny weights count as if they were 0.
+            by_residual = relative(prior, prior.detach())
+            mean = by_residual.square().sum(-1, keepdim=True) / by_residual.sum(-1, keepdim=True).clamp(min=1.0)
+            by_residual = by_residual / torch.where(mean > 0, mean, 1.0)
         poses = starts.poses
         # In memory, rotations have the shape (3, 3, S B), and translations (3, S B), see `problems_last`.
         pose = map_tensors(lambda *x: torch.cat([y.movedim(0, -1) for y in x], -1).movedim(-1, 0), *poses)
@@ -354,7 +355,7 @@ class RobustWeightedLM(Configured):
             robust = found.mixture.weights(seen)
         weights = torch.where(seen.projection.in_front, plan.prior * robust, 0.0)
         cost = self._cost(seen.projection, plan.problem, plan.prior, shape)
-        chance = probability(seen, plan.problem, found, plan.votes.known, odds)
+        chance = probability(seen, plan.problem, found, plan.votes, odds)
         in_front = (seen.projection.in_front & (plan.prior > 0)).sum(-1) >= MIN_PAIRS
         ok = now.solved & in_front & (chance >= LEAST_PROBABILITY)
         return Refinement(now.state, weights, cost, ok, in_front, chance, found)
@@ -362,7 +363,7 @@ class RobustWeightedLM(Configured):
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
         """Fit a mixture to the residuals. Set estimated noise of points to 0 if 0 makes them clearly likelier."""
         problem, noise = plan.problem, plan.problem.noise
-        if noise is None or noise.covariances:
+        if noise is None or noise.world_cov is not None:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
         of_pixels = noise._replace(world=plan.world_sigma)
         both = map_tensors(lambda x, y: torch.cat((x.mT, y.mT), 1).mT, noise, of_pixels)
