@@ -417,7 +417,8 @@ def test_tiny_weights_beside_a_prior_count_as_zero(make_problems, perturb):
     p, inf = make_problems(100, 20), torch.full((20,), torch.inf)
     prior = PosePrior(perturb(p.pose, angle=0.05, shift=0.05), 1e3 * torch.eye(6).expand(20, 6, 6), inf)
     few, solver = (torch.arange(100) < 10).double().expand(20, 100), create_solver("pnpnet-set")
-    none, tiny = (solver(*p[:3], few + x * (1.0 - few), prior=prior, img_sigma=5.0) for x in (0.0, 1e-9))
+    given = {"prior": prior, "img_sigma": 5.0, "world_sigma": 0.05}
+    none, tiny = (solver(*p[:3], few + x * (1.0 - few), **given) for x in (0.0, 1e-9))
     assert (tiny.translation - none.translation).norm(dim=1).median() < 1e-3
 
 
