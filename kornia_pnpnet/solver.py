@@ -424,6 +424,7 @@ class PnPNet(PretrainedMixin):
             # The estimated noise is that of a mean pixel. The caller's pixels have different sizes here.
             unit = (frame.units(problem.focal, inputs.lens_scale) / frame.img_scale[:, None]).detach()
             unit = unit if frame.order is None else unit.gather(1, frame.order)
+            unit = unit if problem.noise is None else torch.where(problem.noise.img.isnan(), unit, 1.0)
             starts = starts._replace(noise=starts.noise._replace(img=starts.noise.img * unit))
         problem = problem._replace(img_scale=frame.img_scale)  # the threshold of RANSAC was in undistorted pixels
         return problem, frame, starts
