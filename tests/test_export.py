@@ -74,7 +74,6 @@ PROGRAMS = "pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm", "pnpnet-set"
 EXPORTS = [
     *(("program", name, 9, None, ((9, 2), (9, 50)), False) for name in PROGRAMS),
     ("program", "pnpnet-set", None, None, [*product((4, 5, 9, 17, 18, 30, 40, 200), (2, 50))], False),
-    ("program", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
     ("onnx", "pnpnet-n9", None, None, ((9, 1), (9, 3), (9, 100)), False),
     ("onnx", "pnpnet-set", None, None, ((4, 3), (9, 1), (9, 50), (20, 50), (100, 20)), False),
     ("onnx", "epnp", None, None, ((4, 5), (9, 4), (50, 2)), False),
@@ -92,6 +91,7 @@ EXPORTS = [
     ("kind", "name", "n", "batch", "sizes", "is_rig"),
     [
         *(("onnx", "identity-lm", 9, batch, ((9, 4),), False) for batch in (4, None)),
+        ("program", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
         *(pytest.param(*export, marks=pytest.mark.slow) for export in EXPORTS),
     ],
 )

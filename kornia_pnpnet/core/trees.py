@@ -32,8 +32,10 @@ def pairs_at(tree: _T, at: Tensor) -> _T:
     """Select pairs by positions (B, K) from each tensor (B, N, ...) with N >= K. Other tensors do not change."""
 
     def pick(x: Tensor) -> Tensor:
-        of_pairs = x.ndim > 1 and x.shape[1] >= at.shape[1]
-        return x.take_along_dim(at.view(*at.shape, *(1,) * (x.ndim - 2)), 1) if of_pairs else x
+        if x.ndim < 2 or x.shape[1] < at.shape[1]:
+            return x
+        # `take_along_dim` would fix the sizes of exported graphs.
+        return x.gather(1, at.view(*at.shape, *(1,) * (x.ndim - 2)).expand(*at.shape, *x.shape[2:]))
 
     return map_tensors(pick, tree)
 
