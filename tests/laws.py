@@ -422,8 +422,6 @@ def isotropic_covariances_are_sigmas(case: Case) -> None:
     sigma = call.pop("img_sigma")
     call["world_sigma"] = 0.0  # what its projection adds to a pixel is not isotropic
     covariance = sigma.square()[..., None, None] * torch.eye(2, dtype=case.dtype)
-    if case.focal == "known":  # the noise of the points may also be unknown
-        del call["world_sigma"]
     results = []
     for noise in ({"img_sigma": sigma}, {"img_cov": covariance}):
         leaf = call["img_points"].clone().requires_grad_()

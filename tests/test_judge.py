@@ -45,6 +45,13 @@ def test_given_noise_is_kept_unless_the_residuals_contradict():
         assert 1000.0 * result.sigma.median() == pytest.approx(1.0, rel=0.1)
 
 
+def test_exact_points_are_found_to_be_exact_beside_covariances_of_pixels(make_problems):
+    p, solver = make_problems(50, 20, img_sigma=0.5, world_sigma=0.0), create_solver("pnpnet-set")
+    covariances = 0.25 * torch.eye(2).double().expand(20, 50, 2, 2)
+    expected, found = solver(*p[:3], img_sigma=0.5), solver(*p[:3], img_cov=covariances)
+    assert (found.matrix - expected.matrix).abs().amax((1, 2)).median() < 1e-4
+
+
 def test_evidence_rises_with_pairs_and_falls_with_noise_and_with_an_incorrect_pose(perturb):
     few, many, noisy = (found(*scene(*x)).log_ratio.median() for x in ((10, 2, 1.0), (40, 8, 1.0), (40, 8, 10.0)))
     assert 0.0 < few < noisy < many
