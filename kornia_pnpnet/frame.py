@@ -306,7 +306,7 @@ def may_be_confidence(values: Tensor) -> Tensor:
 
 
 def focal_length(camera: Tensor) -> Tensor:
-    """Geometric means (*) of the sizes of fx and fy, for valid camera matrices (*, 3, 3)."""
+    r"""Geometric means :math:`(*)` of the sizes of fx and fy, for valid camera matrices :math:`(*, 3, 3)`."""
     return (camera[..., 0, 0] * camera[..., 1, 1]).abs().sqrt()
 
 
