@@ -133,7 +133,7 @@ class Solved(NamedTuple):
 
     pose: Pose
     ok: Tensor
-    milliseconds: Tensor  # of the processor, the same for all problems of a batch
+    milliseconds: Tensor  # elapsed, the same for all problems of a batch
     probability: Tensor  # NaN for problems that do not count
 
 
@@ -321,7 +321,7 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
 
 
 def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
-    """Solve a batch; the result, and milliseconds of the processor for a problem.
+    """Solve a batch; the result, and milliseconds for a problem.
 
     A bound sees the reference poses. Peers with a ratio get the best pairs first; only their own calls are timed.
     """

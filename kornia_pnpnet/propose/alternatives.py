@@ -166,11 +166,11 @@ def reconsider(
     likelihood[0] = found.likelihood
     if replaced is not None:
         likelihood[0].masked_fill_(replaced, torch.finfo(likelihood.dtype).min)
-    likelihood[kind, owners] = of_ends.likelihood
+    of_rivals = of_ends.likelihood
     for mine, its in zip(problem.terms, every.problem.terms, strict=True):
         likelihood[0] -= 0.5 * mine.loss(now.state)
-        likelihood[kind, owners] -= 0.5 * its.loss(tried.state)
-    likelihood[kind, owners] = likelihood[kind, owners].nan_to_num(-torch.inf)
+        of_rivals = of_rivals - 0.5 * its.loss(tried.state)
+    likelihood[kind, owners] = of_rivals.nan_to_num(-torch.inf)
     end[kind, owners] = torch.arange(len(owners), device=owners.device)
     best = likelihood.argmax(0)
     rows = best.nonzero()[:, 0]
