@@ -7,6 +7,7 @@ many problems its poses solve.
 import time
 import warnings
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from torch.utils.benchmark import timer
 
 from kornia_pnpnet import Normalize, PnPNet, RobustWeightedLM, Starts, pose_errors, success, success_rate
 from kornia_pnpnet.core.files import digest
+from kornia_pnpnet.core.trees import take
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation import draw_problems
 from kornia_pnpnet.evaluation.named_solvers import load_solver
@@ -283,16 +285,24 @@ def bare_call(solver: nn.Module, problems: Problems) -> Callable[[], object]:
 
 
 class Peer(Contender):
-    """The calls of another library, one after the other, on arrays in float64 that are prepared."""
+    """The calls of another library, on arrays in float64 that are prepared, in as many threads as PyTorch uses.
+
+    A thread solves its share of the problems, one after the other. kornia-rs keeps Python's lock: it gets one thread.
+    """
 
     loops, differentiable = True, False
 
     def __init__(self, spec: str) -> None:
         self.solver = load_solver(spec)
+        self.threads = 1 if spec == "kornia-rs" else torch.get_num_threads()
+        self.pool = ThreadPoolExecutor(self.threads)
 
     def task(self, problems: Problems, *, backward: bool = False) -> Task:
         """Call the library for each problem. The poses are those of the adapter of this package."""
-        return Task(bare_call(self.solver, problems), lambda: Pose(*self.solver(*problems[:3]).pose), problems)
+        count = min(self.threads, len(problems.world_points))
+        calls = [bare_call(self.solver, take(problems, slice(i, None, count))) for i in range(count)]
+        run = calls[0] if count == 1 else lambda: list(self.pool.map(lambda call: call(), calls))
+        return Task(run, lambda: Pose(*self.solver(*problems[:3]).pose), problems)
 
 
 class KorniaDLT(Contender):

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import contenders
 import torch
 from contenders import OURS, CannotBeTimedError, Contender, N, Task, draw
-from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, seconds, share, summary
+from harness import BACKWARD, FORWARD, HERE, in_turns, parser, say, seconds, share, summary, threads
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.benchmark import timer
@@ -280,7 +280,8 @@ def measure_throughput(device: str, amount: Amount) -> Iterator[dict[str, Any]]:
         torch.compiler.reset()
         if name not in OURS:  # on the CPU, one problem after the other
             say(f"throughput: {name}, n = {n}")
-            task = contenders.CONTENDERS[name]().task(draw(n, amount.batches[0]))
+            with threads():
+                task = contenders.CONTENDERS[name]().task(draw(n, amount.batches[0]))
             task.warm()
             place: dict[str, Any] = {"contender": name, "mode": FORWARD, "n": n, "batch": task.size}
             yield {**place, "success": task.success().rate, **summary([task.us() for _ in range(amount.rounds)])}

@@ -258,6 +258,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         path = options.results / f"{part}.json"
         results = recorded(partial(measure_part, part, settings), **settings._asdict())
         results["environment"]["versions"]["onnxruntime"] = installed.get("onnxruntime")
+        results["peers"] = {name: peer.solver.config() for name, peer in make_contenders(page.PEERS)[0].items()}
         save_results(results, path)
         say(f"wrote {path}")
 
