@@ -8,7 +8,7 @@ The page says what is measured.
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,7 +66,7 @@ def ours(solver: nn.Module, problems: Problems, *, known: bool = False) -> Found
         intrinsics = scale_focal(intrinsics, intrinsics[:, 0, 0].reciprocal())
     inputs = map_tensors(Tensor.float, (problems.world_points, problems.img_points, intrinsics))
     rig = {} if problems.cam_from_rig is None else {"cam_from_rig": map_tensors(Tensor.float, problems.cam_from_rig)}
-    with harness.threads(), torch.no_grad():
+    with torch.no_grad():
         solver(*take(inputs, slice(32)), **{name: take(x, slice(32)) for name, x in rig.items()})
         start = time.perf_counter()
         result = solver(*inputs, **rig)
@@ -78,7 +78,7 @@ def oracle(problems: Problems) -> Found:
     """Least squares on the true inliers, from the true pose and focal length."""
     refine = RobustWeightedLM(30, robustness=0.0)
     solver = PnPNet(None, refine, Normalize(order=False), focal="unknown", focal_sigma=_OPEN)
-    with harness.threads(), torch.no_grad():
+    with torch.no_grad():
         result = solver(*problems[:3], problems.inliers.double(), init=problems.pose)
     return Found(result.pose, result.intrinsics[:, 0, 0], result.ok, 0.0)
 
@@ -90,11 +90,10 @@ def one_by_one(prepare: Callable[..., Callable[[], tuple[np.ndarray, float] | No
     """
     problems = list(zip(*(x.double().numpy() for x in inputs), strict=True))
     calls = [prepare(*one) for one in problems]
-    with harness.threads():
-        prepare(*problems[0])()  # not timed
-        start = time.perf_counter()
-        found = [call() for call in calls]
-        us = 1e6 * (time.perf_counter() - start) / len(found)
+    prepare(*problems[0])()  # not timed
+    start = time.perf_counter()
+    found = [call() for call in calls]
+    us = 1e6 * (time.perf_counter() - start) / len(found)
     columns = zip(*(x or (np.eye(3, 4), 1.0) for x in found), strict=True)
     pose, focal = (torch.from_numpy(np.array(x, dtype=np.float64)) for x in columns)
     return Found(Pose(pose[..., :3], pose[..., 3]), focal, torch.tensor([x is not None for x in found]), us)
@@ -127,12 +126,13 @@ def opencv_focals(world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) ->
     return best
 
 
-#: Solvers of other libraries without the focal length.
-FOCAL_PEERS: dict[str, Callable[[Problems], Found]] = {
+#: Solvers without the focal length: ours, and those of other libraries.
+FOCAL_SOLVERS: dict[str, Callable[[Problems], Found]] = {
+    **{name: partial(ours, create_solver(name, focal="unknown")) for name in OURS},
     "pycolmap": lambda problems: one_by_one(colmap_focal, *problems[:3]),
     "opencv, 21 focals": lambda problems: one_by_one(partial(partial, opencv_focals), *problems[:3]),
 }
-BY_FOCAL = (*OURS, *FOCAL_PEERS, "oracle")
+BY_FOCAL = FOCAL_SOLVERS | {"oracle": oracle}
 
 
 def pinholes(intrinsics: np.ndarray) -> list[dict[str, Any]]:
@@ -191,12 +191,9 @@ def row(found: Found, problems: Problems, *, focal: float = 0.05) -> dict[str, A
     return {**rates, "us": found.us or None, **medians}
 
 
-def rows_of_all(problems: Problems) -> list[dict[str, Any]]:
-    """Rows of our solvers, of the other libraries, and of the oracle."""
-    found = {name: ours(create_solver(name, focal="unknown"), problems) for name in OURS}
-    found |= {name: peer(problems) for name, peer in FOCAL_PEERS.items()}
-    found["oracle"] = oracle(problems)
-    return [{"solver": name, **row(one, problems)} for name, one in found.items()]
+def rows_of(problems: Problems, solvers: Mapping[str, Callable[[Problems], Found]] = BY_FOCAL) -> list[dict[str, Any]]:
+    """A row of each solver."""
+    return [{"solver": name, **row(solve(problems), problems)} for name, solve in solvers.items()]
 
 
 def measure_focal(count: int, sizes: Sequence[int] = SIZES, shares: Sequence[float] = SHARES) -> list[dict[str, Any]]:
@@ -204,33 +201,30 @@ def measure_focal(count: int, sizes: Sequence[int] = SIZES, shares: Sequence[flo
     rows = []
     for k, (n, outliers) in enumerate(itertools.product(sizes, shares)):
         harness.say(f"unknown focal length, n = {n}, {outliers:.0%} outliers")
-        measured = rows_of_all(random_cameras(n, count, SEED + k, outliers))
+        measured = rows_of(random_cameras(n, count, SEED + k, outliers))
         rows += [{"n": n, "share": outliers, **found} for found in measured]
     return rows
 
 
 def measure_cell(count: int, n: int = CELL) -> list[dict[str, Any]]:
     """COLMAP's test: many pairs, half of them outliers."""
-    problems = random_cameras(n, count, SEED + 100, 0.5)
-    found = {name: ours(create_solver(name, focal="unknown"), problems) for name in OURS}
-    found["pycolmap"] = FOCAL_PEERS["pycolmap"](problems)
-    return [{"solver": name, **row(one, problems)} for name, one in found.items()]
+    some = {name: FOCAL_SOLVERS[name] for name in (*OURS, "pycolmap")}
+    return rows_of(random_cameras(n, count, SEED + 100, 0.5), some)
 
 
 def measure_real(data: Path) -> list[dict[str, Any]]:
     """Raw matches of an image with one other image, the focal length withheld."""
     raw = np.load(data / "raw" / "by_image.npz")
-    solvers = {name: partial(ours, create_solver(name, focal="unknown")) for name in OURS} | FOCAL_PEERS
     enough = ((raw["error_px"] < 4.0) & raw["M"]).sum(1) >= 8
     rows = []
     for kind, title in enumerate(("ratio test", "no ratio test")):
-        answers: dict[str, list[dict[str, Tensor]]] = {name: [] for name in solvers}
+        answers: dict[str, list[dict[str, Tensor]]] = {name: [] for name in FOCAL_SOLVERS}
         for i in np.flatnonzero(enough & (raw["kind"] == kind)):
             at = raw["M"][i]
             arrays = raw["W"][i][at], raw["I"][i][at], raw["K"][i], raw["R"][i], raw["t"][i]
             world, img, intrinsics, *pose = (torch.from_numpy(x).double()[None] for x in arrays)
             problems = Problems(world, img, intrinsics, Pose(*pose), torch.ones_like(world[..., 0]).bool())
-            for name, solve in solvers.items():  # in turns, so that a slow minute of the machine hits all of them
+            for name, solve in FOCAL_SOLVERS.items():  # in turns, so that a slow minute of the machine hits all of them
                 found = solve(problems)
                 answers[name].append({**errors(found, problems), "ok": found.ok, "us": torch.tensor([found.us])})
         for name, each in answers.items():
@@ -252,7 +246,7 @@ def measure_scenes(data: Path, count: int) -> list[dict[str, Any]]:
         options: dict[str, Any] = {"n": SCENE_N, "batch_size": count, "seed": SEED + 300 + k, "num_spares": SCENE_N}
         problems = SceneProblems(load_scene(data / folder), **options, outliers=OutlierMix(count=outliers)).batch(0)
         place = {"scene": folder.split("/")[1], "outliers": outliers}
-        rows += [{**place, **found} for found in rows_of_all(problems)]
+        rows += [{**place, **found} for found in rows_of(problems)]
     return rows
 
 

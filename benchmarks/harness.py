@@ -23,6 +23,7 @@ from kornia_pnpnet.core.performance import keep_freed_memory
 from kornia_pnpnet.core.tables import markdown_table
 
 HERE = Path(__file__).resolve().parent
+DOCS = HERE.parent / "docs"
 #: What a call does.
 FORWARD, BACKWARD = "forward", "forward+backward"
 
@@ -71,12 +72,9 @@ def peak_bytes() -> int:
 
 
 def run_child(script: Path, *arguments: str, **environment: str) -> Any:
-    """Run a script in a process of its own and return the JSON that it prints; RuntimeError when the script fails."""
-    command = [sys.executable, str(script), *arguments]
-    variables = {**os.environ, **environment}
-    output = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, env=variables)
-    if output.returncode:
-        raise RuntimeError(f"{' '.join(command)} failed; its error is above.")
+    """Run a script in a process of its own and return the JSON that it prints; raises when the script fails."""
+    command, variables = [sys.executable, str(script), *arguments], {**os.environ, **environment}
+    output = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=variables)
     return json.loads(output.stdout)
 
 
@@ -95,17 +93,20 @@ def parser(description: str | None, out: Path | None = None, *, required: bool =
 def recorded(measure: Callable[[], Row], **settings: Any) -> dict[str, Any]:
     """What a measurement returns, with ``environment``, ``settings``, and ``load_average`` before and after.
 
+    This process uses one thread meanwhile.
+
     Times are not to be trusted where the load average of the last minute is well above the number of threads.
     """
-    made, before = environment(), os.getloadavg()[0]  # the commit is that of the start
-    found = measure()
+    with threads():
+        made, before = environment(), os.getloadavg()[0]  # the commit is that of the start
+        found = measure()
     return {"environment": made, "settings": settings, "load_average": [before, os.getloadavg()[0]], **found}
 
 
 def render(template: str, **facts: Any) -> str:
-    """A page from its template, with the filters below. Missing facts are errors."""
+    """A page from its template here or in ``docs/results``, with the filters below. Missing facts are errors."""
     options: dict[str, Any] = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
-    environment = Environment(loader=FileSystemLoader(HERE), autoescape=False, **options)
+    environment = Environment(loader=FileSystemLoader([HERE, DOCS / "results"]), autoescape=False, **options)
     environment.filters |= {"percent": percent, "digits": three_digits, "foot": foot}
     return environment.get_template(template).render(**facts)
 

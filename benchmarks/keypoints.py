@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import parser, recorded, threads
+from harness import parser, recorded
 from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 
@@ -140,9 +140,8 @@ def main() -> None:
     command.add_argument("--sources", type=Path, required=True, help="JSON: a description of each source, by its file")
     options = command.parse_args()
     sources = json.loads(options.sources.read_text())
-    with threads():
-        settings = {"right": RIGHT, "cap": CAP, "samples": SAMPLES, "dtype": "float64"}
-        made = recorded(lambda: {"results": [measure(path) for path in options.problems]}, **settings)
+    settings = {"right": RIGHT, "cap": CAP, "samples": SAMPLES, "dtype": "float64"}
+    made = recorded(lambda: {"results": [measure(path) for path in options.problems]}, **settings)
     columns = ("error", "capped", "median", "right", "ok")
     for one in made["results"]:
         print({key: value for key, value in one.items() if key != "rows"})

@@ -37,9 +37,11 @@ done
 part uncertainty benchmarks/uncertainty.py --out benchmarks/uncertainty.json
 part upstream benchmarks/upstream.py --out benchmarks/upstream.json
 part scale benchmarks/scale.py --problems 10000000
-for name in fiducial_board incremental_map keypoint_offsets keypoint_pipeline localiser pose_network serve tracking; do
+for name in fiducial_board incremental_map keypoint_offsets keypoint_pipeline localiser pose_network tracking; do
     part $name docs/examples/$name.py --out docs/examples
 done
+part package -c "from kornia_pnpnet.cli import main; raise SystemExit(main())" export outputs/set.pt2 --pairs 50 --batch 1 --overwrite
+part serve docs/examples/serve.py --package outputs/set.pt2 --out docs/examples
 part keypoint_covariances docs/examples/keypoint_pipeline.py --covariances --updates 600 --out docs/examples
 
 if [ -n "${DATA:-}" ]; then

@@ -135,7 +135,7 @@ def load_parts(folder: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
     return {part: found[part] for part in PARTS}, found.get("gpu")
 
 
-def render(folder: Path, path: Path) -> None:
+def render(folder: Path) -> None:
     """Write the page and its pictures from the results files of a folder."""
     results, gpu = load_parts(folder)
 
@@ -143,7 +143,7 @@ def render(folder: Path, path: Path) -> None:
         return [x for x in results[part]["rows"] if x["threads"] == 1 and x["contender"].partition(" ")[0] in DRAWN]
 
     rows, alone = drawn("throughput"), drawn("latency")
-    pictures, size = path.parent / path.stem, results["throughput"]["settings"]["problems"]
+    pictures, size = PAGE.parent / PAGE.stem, results["throughput"]["settings"]["problems"]
     some = [row for row in rows if row["n"] == N and not row["contender"].endswith(" ONNX")]
     batches = {mode: [row for row in some if row["mode"] == mode] for mode in (FORWARD, BACKWARD)}
     kept = {row["contender"] for row in rows if row["n"] != N}
@@ -153,4 +153,4 @@ def render(folder: Path, path: Path) -> None:
     title = f"B = {size}{fewer}, a third of the pairs mismatched, one thread"
     plot_times(pictures / "pairs.png", title, {FORWARD: pairs}, against="n", label="pairs n")
     plot_latency(pictures / "latency.png", "One problem at a time, n = 9, 0 to 3 outliers, one thread", alone)
-    path.write_text(page(results, gpu), encoding="utf-8")
+    PAGE.write_text(page(results, gpu), encoding="utf-8")

@@ -242,7 +242,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command.add_argument("--contenders", nargs="+", help="for measure: only these")
     command.add_argument("--quick", action="store_true", help="a few small problems: does everything run?")
     command.add_argument("--results", type=Path, default=HERE, help="folder of the results files")
-    command.add_argument("--page", type=Path, default=page.PAGE, help="for render: the page to write")
     command.add_argument("--child", help=argparse.SUPPRESS)  # the request of `measure_part` to a process of its own
     options = command.parse_args(arguments)
     if options.child:
@@ -250,7 +249,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(json.dumps(measure_threads(request["part"], Settings(**request["settings"]), request["count"])))
         return
     if options.step == "render":
-        page.render(options.results, options.page)
+        page.render(options.results)
         return
     settings = (QUICK if options.quick else FULL)._replace(contenders=options.contenders)
     installed = {entry.name.lower(): entry.version for entry in distributions()}

@@ -1,6 +1,6 @@
 """One contender in a process of its own: seconds of its first calls, and memory of a large call.
 
-``python process.py '{"contender": "epnp", "backward": false, "batches": [1000], "memory_batch": 10000}'`` prints JSON.
+``python process.py '{"contender": "epnp-lm", "backward": false, "batches": [1000], "memory_batch": 0}'`` prints JSON.
 The top of this file must not import PyTorch: the imports are timed.
 """
 

@@ -7,7 +7,7 @@ problem is one query against one image of the map: each keypoint of the query is
 (kind 1), or only where Lowe's ratio test accepts it (kind 0). The reference pose is the model's.
 
 ``measure`` solves the problems of such files with solvers by name, all in turns in the same run on one thread. A name
-with ``+ratio`` at the end gets 1 - ratio as the confidence of each pair, one with ``+sigma`` gets sigmas of 1 px and 0.
+with ``+ratio`` at the end gets 1 - ratio as the confidence of each pair.
 ``--pictures`` draws failures of the first solver: of each scene the far-off pose with the most inliers under the
 reference pose, and of these the three with the most. ``--batch`` gives the numbers of problems in a call.
 
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from harness import Row, pivot, recorded, say, share, threads
+from harness import Row, pivot, recorded, say, share
 from kornia.geometry import epipolar
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -389,8 +389,7 @@ def measure(
 ) -> dict[str, Any]:
     """Solve the problems with all solvers, with each of the ``sizes`` of a call; draw failures into ``pictures``."""
     solvers, chosen = load_solvers(specs), groups(matches)
-    with threads():
-        solved = {size: solve(solvers, matches, size) for size in sizes}
+    solved = {size: solve(solvers, matches, size) for size in sizes}
     rows: list[dict[str, Any]] = []
     curves: dict[str, Any] = {}
     failures: list[dict[str, Any]] = []
@@ -416,16 +415,15 @@ def measure(
 def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
     """Time solvers on matches without a ratio test, by share of outliers and by number of pairs, in full batches."""
     solvers, chosen, rows = load_solvers(specs), groups(matches), []
-    with threads():
-        for group in (*BY_SHARE, *BY_PAIRS):
-            at = chosen[KINDS[1], group].nonzero()[:, 0]
-            if len(at) < MIN_GROUP:
-                continue
-            given, _ = batch(matches, at[torch.arange(COST_BATCH) % len(at)])
-            for spec, solver in solvers.items():
-                say(f"{group}: {spec}")
-                call(solver, spec, *take(given, slice(2)))  # not timed: slower
-                rows.append({"solver": spec, "group": group, "ms_per_problem": call(solver, spec, *given)[1]})
+    for group in (*BY_SHARE, *BY_PAIRS):
+        at = chosen[KINDS[1], group].nonzero()[:, 0]
+        if len(at) < MIN_GROUP:
+            continue
+        given, _ = batch(matches, at[torch.arange(COST_BATCH) % len(at)])
+        for spec, solver in solvers.items():
+            say(f"{group}: {spec}")
+            call(solver, spec, *take(given, slice(2)))  # not timed: slower
+            rows.append({"solver": spec, "group": group, "ms_per_problem": call(solver, spec, *given)[1]})
     return {"rows": rows}
 
 

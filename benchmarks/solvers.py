@@ -99,11 +99,10 @@ def measure(specs: Sequence[str], *, count: int, repeats: int, memory_count: int
     wanted = [spec for spec, name in name_of.items() if memory_count and name == MEMORY_SOLVER]
     memory = [measure_memory(spec, memory_count) for spec in wanted]
     rows = []
-    with harness.threads():
-        for name, (n, *_) in SETS.items():
-            harness.say(name)
-            chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or name_of[spec] in ROBUST}
-            rows += measure_set(chosen, name, count, repeats)
+    for name, (n, *_) in SETS.items():
+        harness.say(name)
+        chosen = {spec: solver for spec, solver in solvers.items() if n == SMALL or name_of[spec] in ROBUST}
+        rows += measure_set(chosen, name, count, repeats)
     return {"skipped": skipped, "rows": rows, "memory": memory}
 
 
@@ -133,8 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     given = {"count": options.count, "repeats": options.repeats}
     run = partial(measure, options.solvers, **given, memory_count=options.memory_count)
-    with harness.threads():  # so that the environment in the file has one thread
-        results = harness.recorded(run, solvers=options.solvers, **given, seed=SEED, dtype="float64")
+    results = harness.recorded(run, solvers=options.solvers, **given, seed=SEED, dtype="float64")
     if options.out:
         harness.write(options.out, results, page)
     print(page(results))

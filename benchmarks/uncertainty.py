@@ -296,8 +296,7 @@ def main() -> None:
         times = measure_times(create_solver(SOLVER))
         return {"times": times, **{name: part(solver, options.count) for name, part in parts.items()}}
 
-    with harness.threads():
-        results = harness.recorded(measure, seed=SEED, axis_ratio=AXIS_RATIO)
+    results = harness.recorded(measure, seed=SEED, axis_ratio=AXIS_RATIO)
     results |= {"solver": SOLVER, "problems": options.count}
     harness.write(options.out, results, page)
     print(page(results))

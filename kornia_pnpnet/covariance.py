@@ -184,31 +184,40 @@ def shown_noise(
     img_points: Tensor,
     intrinsics: Tensor | PinholeCamera | None,
     weights: Tensor | None,
-    **camera: Any,
+    **more: Any,
 ) -> dict[str, Tensor]:
-    """Estimate the noise of pixels and points from the residuals at a pose.
+    """Estimate the noise of the pixels, and of the points unless it is known, from the residuals at a pose.
 
     At a larger depth, the noise of a point moves the point's pixel less. The noise of a pixel does not depend on the
     depth. Five mixtures of pixel noise and point noise are tried. The largest Gaussian likelihood selects one of them.
 
-    See :func:`pose_covariance` for the arguments. ``camera`` has ``dist``, ``fisheye`` and ``cam_from_rig``. The
-    returned dict has ``img_sigma`` and ``world_sigma``, shape (B,).
+    See :func:`pose_covariance` for the arguments. ``more`` has ``dist``, ``fisheye``, ``cam_from_rig``, and the known
+    ``world_sigma`` or ``world_cov``. The returned dict has ``img_sigma`` and, if unknown, ``world_sigma``, shape (B,).
+    Of ``world_cov`` only the mean of the variances counts.
     """
-    size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose", **camera)
+    if not {"world_sigma", "world_cov"}.isdisjoint(more):
+        more["img_sigma"] = 0.0
+    size, inputs = checked_inputs(world_points, img_points, intrinsics, weights, None, pose, init_name="pose", **more)
     dtype, inputs = inputs.world_points.dtype, map_tensors(_double, inputs)
-    problem, frame = Normalize(order=False)(*inputs[:5], None, None, inputs.rig)
+    problem, frame = Normalize(order=False)(*inputs[:5], inputs.noise, None, inputs.rig)
     projection = project(State.of(frame.start(inputs.init)[0]), problem)
     weights, exact = problem.weights, torch.zeros_like(problem.weights)
     total = weights.sum(1).clamp(min=MIN_PAIRS)
     unit = frame.units(problem.focal, inputs.lens_scale).expand_as(weights)
-    # Variance of each pixel if only the caller's pixels, or only the points, have noise of the standard deviation 1.
-    of_pixels, of_points = unit.square(), pixel_variance(projection, Noise(exact, torch.ones_like(exact)))
+    # Variance of each pixel if only the caller's pixels have noise, of the standard deviation 1, or only the points, of
+    # the standard deviation 1 or the known noise.
+    noise = problem.noise or Noise(exact, torch.ones_like(exact))
+    of_pixels, of_points = unit.square(), torch.where(weights > 0, pixel_variance(projection, noise), 0.0)
     by_pixel, mean = ((weights * x).sum(1) / total for x in (of_pixels, of_points))
+    freedom = (2.0 * total - 6.0).clamp(min=1.0)
+    if problem.noise is not None:
+        rest = (weights * projection.sq_residual).sum(1) / freedom - mean
+        return {"img_sigma": restore_leading(size, (rest.clamp(min=0.0) / by_pixel).sqrt().to(dtype))}
     share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)
     variance = share[..., None] * of_pixels / by_pixel[:, None]  # (S, B, N)
     variance = variance + (1.0 - share[..., None]) * of_points / mean[:, None]
     variance = torch.where(weights > 0, variance, 1.0)
-    scale = (weights * projection.sq_residual / variance).sum(-1) / (2.0 * total - 6.0).clamp(min=1.0)  # (S, B)
+    scale = (weights * projection.sq_residual / variance).sum(-1) / freedom  # (S, B)
     best = (total * scale.log() + (weights * variance.log()).sum(-1)).nan_to_num(torch.inf).argmin(0)
     share, scale = share[best, 0], scale.gather(0, best[None])[0]
     img, world = (share * scale / by_pixel).sqrt(), ((1.0 - share) * scale / mean).sqrt() * frame.size

@@ -13,16 +13,17 @@ from typing import Any, NamedTuple
 
 import torch
 from kornia.core.exceptions import ValueCheckError
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor, nn
 
-from kornia_pnpnet.core.checks import check_shapes, check_whole
+from kornia_pnpnet.core.checks import check_shapes, check_tensors, check_whole
 from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.files import atomic_open
 from kornia_pnpnet.core.performance import INLINE, package_options
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.problem import MIN_PAIRS
 from kornia_pnpnet.propose.initialiser import trait
-from kornia_pnpnet.result import Pose
+from kornia_pnpnet.result import Pose, camera_matrices
 from kornia_pnpnet.solver import PnPNet
 
 __all__ = [
@@ -129,22 +130,7 @@ def export_program(
         >>> dict(zip(OUTPUTS, program.module()(*inputs)))["ok"]
         tensor([False, False, False, False, False])
     """
-    if trait(solver.init, "takes_given"):
-        raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
-    nominal = trait(solver.init, "estimates_noise") and solver.refine.by_residual
-    if solver.focal == "unknown" and (solver.radial or not nominal):
-        raise ValueCheckError(
-            "With an unknown focal length, only a solver with SetInit, with iterations by residual and without radial"
-            " distortion can be exported."
-            " Other solvers search for the focal length, and the number of samples depends on the data."
-        )
-    if rig and (solver.focal == "unknown" or solver.init is None):
-        raise ValueCheckError("For rigs a solver needs an initialiser and known focal lengths.")
-    check_whole(3, n=3 if n is None else n)
-    check_whole(1, _MAX_BATCH, batch=1 if batch is None else batch)
-    fixed = _fixed_n(solver, n)
-    if n not in (None, fixed):
-        raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
+    fixed = _checked_n(solver, n, batch=batch, rig=rig)
     pairs, count = fixed or 12, int(batch or 3)
     problems = CameraProblems(n=pairs, batch_size=count, cameras=3 if rig else 1).batch(0)
     inputs = (*problems[:3], torch.ones_like(problems.world_points[..., 0]), *(problems.cam_from_rig or ()))
@@ -159,10 +145,26 @@ def export_program(
         raise ValueCheckError(f"{type(solver.init).__name__} cannot be exported: {_reason(error)}") from error
 
 
-def _fixed_n(solver: PnPNet, n: int | None) -> int | None:
-    """Return the fixed number of pairs of a program, or ``None`` if the program takes any number."""
+def _checked_n(solver: PnPNet, n: int | None, *, batch: int | None, rig: bool) -> int | None:
+    """Check the arguments, and return the fixed number of pairs of a program, ``None`` if it takes any number."""
+    if trait(solver.init, "takes_given"):
+        raise ValueCheckError("RANSAC cannot be exported: the number of its samples depends on the data.")
+    nominal = trait(solver.init, "estimates_noise") and solver.refine.by_residual
+    if solver.focal == "unknown" and (solver.radial or not nominal):
+        raise ValueCheckError(
+            "With an unknown focal length, only a solver with SetInit, with iterations by residual and without radial"
+            " distortion can be exported."
+            " Other solvers search for the focal length, and the number of samples depends on the data."
+        )
+    if rig and (solver.focal == "unknown" or solver.init is None):
+        raise ValueCheckError("For rigs a solver needs an initialiser and known focal lengths.")
+    check_whole(3, n=3 if n is None else n)
+    check_whole(1, _MAX_BATCH, batch=1 if batch is None else batch)
     config: Any = getattr(solver.init, "config", {})
-    return int(config["n"]) if trait(solver.init, "fixed_pairs") else n
+    fixed = int(config["n"]) if trait(solver.init, "fixed_pairs") else n
+    if n not in (None, fixed):
+        raise ValueCheckError(f"The solver's network was built for n = {fixed}, got n = {n!r}.")
+    return fixed
 
 
 def _reason(error: Exception) -> str:
@@ -223,7 +225,9 @@ def export_package(
 
     sizes = {f"n{size}": size for size in n} if isinstance(n, Sequence) else {_MODEL: n}
     check_whole(1, sizes=len(sizes))
-    files = {name: _compiled(solver, size, batch=batch, rig=rig) for name, size in sizes.items()}
+    # All numbers are checked before the first model is compiled.
+    fixed = {name: _checked_n(solver, size, batch=batch, rig=rig) for name, size in sizes.items()}
+    files = {name: _compiled(solver, size, batch=batch, rig=rig) for name, size in fixed.items()}
     content = io.BytesIO()
     package_aoti(content, files)
     with atomic_open(path, "wb") as file:
@@ -231,10 +235,9 @@ def export_package(
     return path
 
 
-def _compiled(solver: PnPNet, n: int | None, *, batch: int | None, rig: bool) -> Any:
+def _compiled(solver: PnPNet, pairs: int | None, *, batch: int | None, rig: bool) -> Any:
     """Compile a solver, and return the files of one model of a package."""
-    program = export_program(solver, n, batch=batch, rig=rig)
-    pairs = _fixed_n(solver, n)
+    program = export_program(solver, pairs, batch=batch, rig=rig)
     metadata = {_BATCH: str(batch or _ANY), _N: str(pairs or _ANY), _RIG: str(rig)}
     # For one problem, operator calls and allocations take most of the time, and inlined operators avoid both. For
     # several problems, inlined operators are slower than calls.
@@ -270,12 +273,12 @@ class PackagedSolver:
         self,
         world_points: Tensor,
         img_points: Tensor,
-        intrinsics: Tensor,
+        intrinsics: Tensor | PinholeCamera,
         weights: Tensor | None = None,
         *,
         cam_from_rig: Pose | None = None,
     ) -> ExportedResult | ExportedCamera:
-        """Solve a batch of problems. See ``PnPNet.forward``. A package for rigs requires ``cam_from_rig``.
+        """Solve a batch of problems of pixels, see ``PnPNet.forward``. A package for rigs requires ``cam_from_rig``.
 
         Raises:
             ShapeError: when a shape differs from the shapes for which the package was compiled.
@@ -288,7 +291,8 @@ class PackagedSolver:
         any_number = not self.sizes or (len(self.sizes) > 1 and given <= size)
         batch, n = self.batch or batch, max(given, MIN_PAIRS if self.sizes else 4) if any_number else size
         weights = world_points.new_ones(batch, n) if weights is None else weights
-        cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
+        cameras, intrinsics = (batch, n, 3, 3) if self.rig else (batch, 3, 3), camera_matrices(intrinsics)
+        check_tensors({"intrinsics": intrinsics})
         intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
         inputs = [world_points, img_points, intrinsics, weights, *(cam_from_rig or ())]

@@ -64,7 +64,7 @@ class PeerSolver(nn.Module):
     """
 
     threshold: float
-    #: Processor time, in seconds, of the library's calls in the last call of the layer.
+    #: Elapsed time, in seconds, of the library's calls in the last call of the layer.
     library_s: float = field(default=math.nan, init=False, repr=False)
     #: Name of the module to import, and name of the library for error messages.
     source: ClassVar[tuple[str, str]]

@@ -192,7 +192,8 @@ class PretrainedMixin(nn.Module):
         """Write ``config.json`` and ``model.safetensors`` to a folder. A missing folder is created.
 
         Raises:
-            ValueCheckError: when :meth:`from_pretrained` would refuse the files.
+            ValueCheckError: for RANSAC or an initialiser of your own, and when :meth:`from_pretrained` would refuse
+                the files.
         """
         config = self.config()
         if self.init is not None and config["init"]["name"] not in _INITIALISERS:

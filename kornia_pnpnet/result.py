@@ -364,7 +364,7 @@ class PnPResult(NamedTuple):
         lines = (
             ", ".join([f"{int(ok.sum())} of {len(ok)} ok", *(f"{n} {name}" for name, n in failed.items())]),
             f"inliers {spread(inliers.sum(1))} of {inliers.shape[1]}",
-            f"sigma {spread(sigma)} px",
+            f"sigma {spread(sigma)}",
             f"probability {spread(probability)}",
             f"{pose} ({translation.dtype}, {translation.device})",
         )
@@ -391,9 +391,9 @@ class PnPResult(NamedTuple):
             intrinsics: the camera matrices of the solver's call. With ``focal="unknown"``, the result's ``intrinsics``
                 and ``dist`` are used instead.
             more: further arguments of ``pose_covariance``. The lens and the rig must be those of the solver's call. The
-                default weights are ``inliers``. If no noise is given, the noise is estimated from the residuals of the
-                inliers (see :func:`~kornia_pnpnet.covariance.shown_noise`). If only noise of the points is given,
-                ``sigma`` is the noise of the pixels.
+                default weights are ``inliers``. If the noise of the pixels is not given, it is estimated from the
+                residuals of the inliers (see :func:`~kornia_pnpnet.covariance.shown_noise`). The noise of the points is
+                then estimated, too, unless it is given.
 
         Returns:
             Shape :math:`(B, 6, 6)`, see ``pose_covariance``.
@@ -406,11 +406,10 @@ class PnPResult(NamedTuple):
             more.setdefault("dist", self.dist)
         if "weights" not in more and self.inliers is not None:
             more["weights"] = self.inliers.to(self.rotation.dtype)
-        if not {"img_sigma", "img_cov", "world_sigma", "world_cov"}.isdisjoint(more):
-            more.setdefault("img_sigma", None if "img_cov" in more else self.sigma)
-        else:
-            camera = {name: more[name] for name in ("dist", "fisheye", "cam_from_rig") if name in more}
-            more |= shown_noise(self.pose, world_points, img_points, intrinsics, more.get("weights"), **camera)
+        if {"img_sigma", "img_cov"}.isdisjoint(more):
+            names = {"dist", "fisheye", "cam_from_rig", "world_sigma", "world_cov"}
+            known = {name: x for name, x in more.items() if name in names}
+            more |= shown_noise(self.pose, world_points, img_points, intrinsics, more.get("weights"), **known)
         return pose_covariance(self.pose, world_points, img_points, intrinsics, **more)
 
 

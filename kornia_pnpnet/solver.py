@@ -248,9 +248,11 @@ class PnPNet(PretrainedMixin):
                 initialiser was not built for.
             TypeCheckError: for arguments that are not tensors, and for tensors of booleans or complex numbers.
             DeviceError: for tensors on different devices, or on another device than a network of the solver.
-            ValueCheckError: when a sigma and a covariance are both given for the pixels or for the points, when an
-                unknown focal length is combined with distortion or with a rig, when a rig is combined with distortion
-                or with ``alternatives``, or when neither the solver nor the call gives a start for a rig.
+            ValueCheckError: when a sigma and a covariance are both given for the pixels or for the points, when
+                ``dist`` and ``fisheye`` are both given, when an unknown focal length is combined with distortion or
+                with a rig, when a rig is combined with distortion or with ``alternatives``, or when neither the solver
+                nor the call gives a start for a rig.
+            BaseError: when ``alternatives`` is no whole number of at least 0.
         """
         size, inputs = checked_inputs(
             *(world_points, img_points, intrinsics, weights, mask, init),

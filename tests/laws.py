@@ -17,7 +17,6 @@ from kornia.core.exceptions import DeviceError, ShapeError, TypeCheckError, Valu
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.camera import distort_points_kannala_brandt
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, normalize_points_with_intrinsics
-from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import pad
 from torch.utils import _pytree as pytree
@@ -104,7 +103,7 @@ def make(case: Case, batch: int = BATCH, seed: int = 0) -> tuple[Call, Pose]:
             call["img_points"] = _apply(rig.rotation.mT, rays)
         else:
             call |= {"cam_from_rig": rig, "intrinsics": intrinsics[:, None].repeat(1, n, 1, 1)}
-        in_rig = _apply(rig.rotation.mT, transform_points(p.pose.matrix, p.world_points) - rig.translation)
+        in_rig = _apply(rig.rotation.mT, p.true_cam_points - rig.translation)
         call["world_points"] = (in_rig - p.pose.translation[:, None]) @ p.pose.rotation
     if case.noise == "sigma":
         call["img_sigma"] = size[..., 0] * torch.linspace(0.7, 1.4, n, dtype=torch.float64)
@@ -140,8 +139,7 @@ def distorted(pixels: Tensor, intrinsics: Tensor, dist: Any = None, fisheye: Any
     """The pixels of a lens at which a pinhole camera sees ``pixels``."""
     if fisheye is None:
         return distort_points(pixels, intrinsics, dist)
-    camera = [intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 2], intrinsics[:, 1, 2]]
-    coefficients = torch.stack([*camera, *fisheye.T], -1)[:, None]
+    coefficients = torch.cat((intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2], fisheye), -1)[:, None]
     return distort_points_kannala_brandt(normalize_points_with_intrinsics(pixels, intrinsics), coefficients)
 
 

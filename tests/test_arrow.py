@@ -195,7 +195,7 @@ def test_columns_that_would_have_no_effect_are_refused(name, make_problems):
         SOLVE(table.append_column(name, pa.array([[0.0] * 4] * 2)))
 
 
-def test_results_of_shards_are_those_of_the_tables_and_not_taken_for_those_of_another_solver(shards, tmp_path):
+def test_results_of_shards_are_those_of_the_tables_and_not_taken_for_others(shards, tmp_path):
     (folder, drawn), out = shards, tmp_path / "out"
     report = solve_shards(SOLVE, [folder], out, name="reppnp", batch=7)
     assert report == (sum(int(SOLVE.solver(*p[:3]).ok.sum()) for p in drawn), 21, 3, 0, [])
@@ -206,6 +206,10 @@ def test_results_of_shards_are_those_of_the_tables_and_not_taken_for_those_of_an
     for solve, name in ((other, "pnpnet-n9"), *((x, "reppnp") for x in (other, option, camera, focal))):
         with pytest.raises(InputError, match=name):
             solve_shards(solve, [folder], out, name=name)
+    np.savez(tmp_path / "part0.npz", **arrays(drawn[1]))  # has the name of another shard
+    with pytest.raises(InputError, match="no results of reppnp with these options for"):
+        solve_shards(SOLVE, [tmp_path / "part0.npz"], out, name="reppnp")
+    assert solve_shards(SOLVE, [folder], out, name="reppnp").kept == 3
     assert solve_shards(other, [folder], out, name="pnpnet-n9", overwrite=True).shards == 3
     (out / "part0.parquet").write_bytes(b"{")
     with pytest.raises(InputError, match="part0"):
@@ -243,8 +247,7 @@ def test_a_shard_that_cannot_be_read_stops_no_other(shards, tmp_path):
     parquet.write_table(table_of(drawn[0]).drop_columns("intrinsics"), folder / "h.parquet")
     report = solve_shards(SOLVE, [folder], tmp_path / "out", name="reppnp")
     assert report.shards == 3
-    for name, line in zip("abcdefgh", report.failed, strict=True):
-        assert f"/{name}." in line
+    assert all(f"/{name}." in line for name, line in zip("abcdefgh", report.failed, strict=True))
     assert sorted(x.stem for x in (tmp_path / "out").iterdir()) == ["part0", "part1", "part2"]
 
 
@@ -255,8 +258,7 @@ def test_weights_noise_and_a_shared_camera_in_arrays(make_problems, tmp_path):
     np.savez(tmp_path / "x.npz", **arrays(p) | {"weights": weights.numpy()} | of_all)
     solver = create_solver("pnpnet-set")
     solve_shards(Solve(solver), [tmp_path / "x.npz"], tmp_path / "out", name="pnpnet-set")
-    with torch.no_grad():
-        expected = solver(*p[:3], weights=weights, img_sigma=1.0)
+    expected = solver(*p[:3], weights=weights, img_sigma=1.0)
     found = parquet.read_table(tmp_path / "out" / "x.parquet")
     np.testing.assert_allclose(found["rotation"].to_pylist(), expected.rotation.flatten(1), atol=1e-5)
 

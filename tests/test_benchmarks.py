@@ -244,26 +244,19 @@ def test_pages_are_written_from_their_files():
         assert load(name, *PEERS).page(results) == (FOLDER / f"{name}.md").read_text(encoding="utf-8")
 
 
-def write_matches(path, seed):
-    """A file of ``make`` with synthetic problems: 4 outliers among 40 with the ratio test, 32 without."""
-    counts, each = (4, 32), 6
-    options = {"n": 40, "batch_size": each, "seed": seed, "world_sigma": 0.0, "dtype": torch.float64}
-    parts = [SyntheticProblems(outliers=OutlierMix(count=count), **options).batch(0) for count in counts]
-    p = map_tensors(lambda *x: torch.cat(x), *parts)
-    arrays = {"world": p.world_points, "pixels": p.img_points, "mask": p.inliers | True, "K": p.intrinsics}
-    arrays |= {"ratio": torch.where(p.inliers, 0.5, 0.9), "R": p.pose.rotation, "t": p.pose.translation}
-    arrays["error_px"] = reprojection_errors(p).norm(dim=-1)
-    arrays["kind"] = torch.arange(len(counts)).repeat_interleave(each)
-    np.savez_compressed(path, **{name: value.numpy() for name, value in arrays.items()})
-
-
 def test_real_matches_are_measured_and_failures_drawn(tmp_path):
     real_matches = load("real_matches", "pandas", "poselib")
     files = [tmp_path / f"{name}.npz" for name in ("yard", "room")]
-    for seed, file in enumerate(files):
-        write_matches(file, seed)
+    for seed, file in enumerate(files):  # as of ``make``: 4 outliers among 40 with the ratio test, 32 without
+        options = {"n": 40, "batch_size": 6, "seed": seed, "world_sigma": 0.0, "dtype": torch.float64}
+        parts = [SyntheticProblems(outliers=OutlierMix(count=count), **options).batch(0) for count in (4, 32)]
+        p = map_tensors(lambda *x: torch.cat(x), *parts)
+        arrays = {"world": p.world_points, "pixels": p.img_points, "mask": p.inliers | True, "K": p.intrinsics}
+        arrays |= {"ratio": torch.where(p.inliers, 0.5, 0.9), "R": p.pose.rotation, "t": p.pose.translation}
+        arrays |= {"error_px": reprojection_errors(p).norm(dim=-1), "kind": torch.arange(2).repeat_interleave(6)}
+        np.savez_compressed(file, **{name: value.numpy() for name, value in arrays.items()})
     specs = ["p3p-ransac:max_samples=3", "p3p-ransac:threshold=8", "p3p-ransac:threshold=8+ratio", "known-inliers"]
-    specs += ["poselib:threshold=8+ratio", "pnpnet-set+sigma"]
+    specs += ["poselib:threshold=8+ratio", "pnpnet-set+ratio"]
     more = ["--split", "made up", "--pictures", tmp_path, "--batch", 500, 1, "--solvers", *specs]
     real_matches.main([str(x) for x in ("measure", *files, "--out", tmp_path / "out.json", *more)])
     results = json.loads((tmp_path / "out.json").read_text())

@@ -12,22 +12,13 @@ from kornia.geometry.linalg import inverse_transformation, transform_points
 from laws import distorted
 from torch.nn import functional
 
-from kornia_pnpnet import (
-    PnPNet,
-    Pose,
-    PosePrior,
-    create_solver,
-    monte_carlo_pose_loss,
-    pose_covariance,
-    pose_errors,
-    solve_pnp,
-)
+from kornia_pnpnet import Noise, PnPNet, Pose, PosePrior, create_solver, pose_covariance, pose_errors, solve_pnp
 from kornia_pnpnet.cameras import bearing_cameras, bearings, undistort
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.data import CameraProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliersAndNoise
+from kornia_pnpnet.likelihood import monte_carlo_pose_loss
 from kornia_pnpnet.losses import SetLoss
-from kornia_pnpnet.problem import Noise
 from kornia_pnpnet.propose.focal import scale_focal
 from kornia_pnpnet.refine.residual import retract
 

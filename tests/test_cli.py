@@ -19,7 +19,6 @@ from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, list_solvers, shipp
 from kornia_pnpnet.cameras import reproject
 from kornia_pnpnet.cli import COMMANDS, main
 from kornia_pnpnet.cli.demo import verdict
-from kornia_pnpnet.core import files
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.named_solvers import BOUNDS, default_solvers, load_solver
 from kornia_pnpnet.evaluation.results import load_results
@@ -27,6 +26,18 @@ from kornia_pnpnet.evaluation.results import load_results
 CAMERA = "800,810,320,240"
 HEADER, GOOD = "X,Y,Z,u,v\n", "1,2,3,4,5\n"
 K = torch.tensor([[800.0, 0, 320], [0, 810, 240], [0, 0, 1]], dtype=torch.float64)
+#: Contents of files, and the error.
+BAD_CSV = [("\n \n", ":1: expected the header X,Y,Z,u,v"), (HEADER + GOOD + "1,2,3,4,5,6\n" + GOOD, ":3: 6 values")]
+BAD_CSV += [(f"X,{HEADER}{GOOD}", ":1: expected the header"), (HEADER + '1,2,3,4,"5\n' + GOOD, ":3: not a CSV file")]
+BAD_CSV += [("\nX,Z,v\n1,2,3\n", ":2: expected the header X,Y,Z,u,v, each once, found 'X,Z,v'")]
+BAD_CSV += [(HEADER + GOOD + GOOD + "1,2,x,4,5\n", ":4: Z must be a finite number, got 'x'")]
+BAD_CSV += [(HEADER + "\n" + GOOD + "1,2,,4,5\n", ":4: Z must be a finite number, got ''")]
+BAD_CSV += [(HEADER + "1,2,3,nan,5\n" + GOOD, ":2: u must be a finite number, got 'nan'")]
+BAD_CSV += [("X,Y,Z,u,v,weights\n1,2,3,4,5,1\n", ": the column weights is not read: pairs of weight 0")]
+BAD_CSV += [("X,Y,Z,u,v,img_sigma\n1,2,3,4,5,1\n", ": the column img_sigma is not read")]
+BAD_CSV += [("X,Y,Z,u,v,weight\n1,2,3,4,5,-1\n", ":2: weight must be a number of at least 0, got '-1'")]
+BAD_CSV += [(HEADER + GOOD * 2, ": a pose needs at least 3 correspondences, got 2")]
+BAD_CSV += [(HEADER.encode() + b"\xff\xfe\n", ":2: not a text file in UTF-8")]
 
 
 def points(n=9):
@@ -171,24 +182,7 @@ def test_no_pose_is_exit_code_one_with_the_reason(tmp_path):
     assert "float64" in err
 
 
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        ("\n \n", ":1: expected the header X,Y,Z,u,v"),
-        ("\nX,Z,v\n1,2,3\n", ":2: expected the header X,Y,Z,u,v, each once, found 'X,Z,v'"),
-        (f"X,{HEADER}{GOOD}", ":1: expected the header"),
-        (HEADER + GOOD + "1,2,3,4,5,6\n" + GOOD, ":3: 6 values"),
-        (HEADER + GOOD + GOOD + "1,2,x,4,5\n", ":4: Z must be a finite number, got 'x'"),
-        (HEADER + "\n" + GOOD + "1,2,,4,5\n", ":4: Z must be a finite number, got ''"),
-        (HEADER + "1,2,3,nan,5\n" + GOOD, ":2: u must be a finite number, got 'nan'"),
-        ("X,Y,Z,u,v,weights\n1,2,3,4,5,1\n", ": the column weights is not read: pairs of weight 0"),
-        ("X,Y,Z,u,v,img_sigma\n1,2,3,4,5,1\n", ": the column img_sigma is not read"),
-        ("X,Y,Z,u,v,weight\n1,2,3,4,5,-1\n", ":2: weight must be a number of at least 0, got '-1'"),
-        (HEADER + GOOD * 2, ": a pose needs at least 3 correspondences, got 2"),
-        (HEADER + '1,2,3,4,"5\n' + GOOD, ":3: not a CSV file"),
-        (HEADER.encode() + b"\xff\xfe\n", ":2: not a text file in UTF-8"),
-    ],
-)
+@pytest.mark.parametrize(("content", "expected"), BAD_CSV)
 def test_bad_csv_files(tmp_path, content, expected):
     path = tmp_path / "bad.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -218,7 +212,7 @@ def test_bad_npz_files(tmp_path, monkeypatch):
         err = refused("solve", path)
         assert err.startswith(f"pnpnet: {path}: ")
         assert expected in err
-    monkeypatch.setattr(files, "MOST_BYTES", 10**6)
+    monkeypatch.setattr("kornia_pnpnet.core.files.MOST_BYTES", 10**6)
     np.savez_compressed(path, world_points=np.zeros((50_000, 3)), img_points=np.zeros((50_000, 2)))
     assert path.stat().st_size < 10_000
     assert "more than 0.0 GB: split the file" in refused("solve", path, "--intrinsics", CAMERA)
@@ -227,41 +221,32 @@ def test_bad_npz_files(tmp_path, monkeypatch):
 BAD_CAMERAS = ("1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,0,320,240", "8,8,nan,2")
 PINHOLE = "PINHOLE,640,480,800,810,320,240"
 SOLVE, EVALUATE = f"solve pairs.csv --intrinsics {CAMERA}", "evaluate --problems 5 --out results.json"
+#: Arguments, and what the error names.
+BAD = [("", ""), ("fly", "fly"), ("solve", "FILE"), ("export x.onnx --pairs 6,9", "one number of pairs")]
+BAD += [(f"solve pairs.csv --intrinsics={camera}", "pnpnet: --intrinsics: ") for camera in BAD_CAMERAS]
+BAD += [(f"{SOLVE} --camera {PINHOLE}", "--camera stands alone"), ("solve pairs.csv pairs.csv", "--batch")]
+BAD += [("solve pairs.csv --camera PINHOLE,640,480,800", "--camera: expected MODEL")]
+BAD += [(f"solve pairs.csv --camera {PINHOLE} --solver epnp:focal=unknown", "a known focal length")]
+BAD += [(f"{SOLVE} --threshold 0", "--threshold"), (f"{SOLVE} --focal=-1", "--focal")]
+BAD += [(f"{SOLVE} --focal 1200", "--intrinsics 1200,1200,cx,cy"), (f"{SOLVE} --out x", "--out need --batch")]
+BAD += [(f"{SOLVE} --focal 0.1 --diagnose", "--diagnose needs a known focal length")]
+BAD += [(f"{SOLVE} --focal unknown --solver poselib", "does not estimate focal lengths")]
+BAD += [(f"{SOLVE} --batch {option}", "not for --batch") for option in ("--json", "--plot x.png")]
+BAD += [(f"{SOLVE} --plot x.txt", "a .pdf, .png or .svg file"), (f"{SOLVE} --plot mine.png", "--overwrite")]
+BAD += [(f"{SOLVE} --solver {name}", name) for name in ("nobody", "tests")]
+BAD += [(f"{SOLVE} --solver opencv-ransac:{option}=no", option) for option in ("speed", "refine")]
+BAD += [(f"solve {path} --intrinsics {CAMERA}", f"{path}: ") for path in ("missing.csv", "sub")]
+BAD += [(f"{EVALUATE} --{option} nowhere", "nowhere") for option in ("data", "solver")]
+BAD += [(f"{EVALUATE} --outliers none,{word}", repr(word)) for word in ("some", "", "120%", "x%")]
+BAD += [(f"{EVALUATE} --n {n}", why) for n, why in (("9,", "--n"), ("20,6 --outliers 7", "n = 6"))]
+BAD += [(f"{EVALUATE} --n 9,2", "at least 3 pairs, got 2")]
+BAD += [(f"{EVALUATE} --solver known-inliers:threshold=3", "threshold"), (f"{SOLVE} --solver known-inliers", "bound")]
+BAD += [(f"export {name}", ".pt2") for name in ("model", "model.pt", "model.so", ".onnx")]
+BAD += [("export x.onnx --solver opencv-ransac", "opencv-ransac belongs to another library")]
+BAD += [(f"export {name}", "--overwrite") for name in ("mine.onnx", "mine.pt2")]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "culprit"),
-    [
-        *(("", ""), ("fly", "fly"), ("solve", "FILE")),
-        *((f"solve pairs.csv --intrinsics={camera}", "pnpnet: --intrinsics: ") for camera in BAD_CAMERAS),
-        (f"{SOLVE} --camera {PINHOLE}", "--camera stands alone"),
-        ("solve pairs.csv --camera PINHOLE,640,480,800", "--camera: expected MODEL"),
-        *((f"{SOLVE} --threshold 0", "--threshold"), (f"{SOLVE} --focal=-1", "--focal")),
-        (f"{SOLVE} --focal 1200", "--intrinsics 1200,1200,cx,cy"),
-        (
-            "solve pairs.csv --camera PINHOLE,640,480,800,800,320,240 --solver epnp:focal=unknown",
-            "a known focal length",
-        ),
-        (f"{SOLVE} --focal 0.1 --diagnose", "--diagnose needs a known focal length"),
-        *((f"{SOLVE} --batch {option}", "not for --batch") for option in ("--json", "--plot x.png")),
-        ("solve pairs.csv pairs.csv", "--batch"),
-        *((f"{SOLVE} --plot x.txt", "a .pdf, .png or .svg file"), (f"{SOLVE} --plot mine.png", "--overwrite")),
-        *((f"{SOLVE} --out x", "--out need --batch"), ("export x.onnx --pairs 6,9", "one number of pairs")),
-        (f"{SOLVE} --focal unknown --solver poselib", "does not estimate focal lengths"),
-        *((f"{SOLVE} --solver {name}", name) for name in ("nobody", "tests")),
-        *((f"{SOLVE} --solver opencv-ransac:{option}=no", option) for option in ("speed", "refine")),
-        (f"{SOLVE} --solver known-inliers", "bound"),
-        *((f"solve {path} --intrinsics {CAMERA}", f"{path}: ") for path in ("missing.csv", "sub")),
-        *((f"{EVALUATE} --{option} nowhere", "nowhere") for option in ("data", "solver")),
-        *((f"{EVALUATE} --outliers none,{word}", repr(word)) for word in ("some", "", "120%", "x%")),
-        *((f"{EVALUATE} --n {n}", why) for n, why in (("9,", "--n"), ("20,6 --outliers 7", "n = 6"))),
-        (f"{EVALUATE} --n 9,2", "at least 3 pairs, got 2"),
-        (f"{EVALUATE} --solver known-inliers:threshold=3", "threshold"),
-        *((f"export {name}", ".pt2") for name in ("model", "model.pt", "model.so", ".onnx")),
-        ("export x.onnx --solver opencv-ransac", "opencv-ransac belongs to another library"),
-        *((f"export {name}", "--overwrite") for name in ("mine.onnx", "mine.pt2")),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "culprit"), BAD)
 def test_bad_arguments(csv_file, tmp_path, monkeypatch, arguments, culprit):
     (tmp_path / "sub").mkdir()
     before = {"mine.onnx": "mine", "mine.pt2": "mine", "mine.png": "mine", "pairs.csv": csv_file.read_text()}

@@ -23,29 +23,13 @@ from kornia_pnpnet.likelihood import monte_carlo_pose_loss
 from kornia_pnpnet.measurements import depth_points, heatmap_keypoints
 from kornia_pnpnet.metrics import pose_errors
 from kornia_pnpnet.problem import State
-from kornia_pnpnet.refine.residual import retract
+from kornia_pnpnet.refine.residual import retract, tangent
 
 DOUBLE = torch.float64
 CAMERA = torch.tensor([[800.0, 30.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]], dtype=DOUBLE)
 
 
-def tangent(estimate, truth):
-    """(omega, v) of the estimate from the truth."""
-    turn = conversions.rotation_matrix_to_axis_angle(estimate.rotation @ truth.rotation.mT)
-    return torch.cat((turn, estimate.translation - truth.translation), -1)
-
-
-def test_zero_weight_equals_removing(make_problems):
-    p = make_problems(n=12, batch=5)
-    weights = (torch.arange(12) < 8).double().expand(5, 12)
-    world, sigma = p.world_points.clone(), torch.full((5, 12), 2.0, dtype=DOUBLE)
-    world[:, 8:], sigma[:, 8:] = torch.nan, torch.nan
-    half = pose_covariance(p.pose, world, *p[1:3], img_sigma=sigma, weights=weights)
-    part = pose_covariance(p.pose, p.world_points[:, :8], p.img_points[:, :8], p.intrinsics, img_sigma=2.0)
-    torch.testing.assert_close(half, part)
-
-
-def test_units_of_the_noise(make_problems):
+def test_units_of_the_noise_and_pairs_without_weight(make_problems):
     p = make_problems(n=12, batch=5)
     plain = pose_covariance(p.pose, *p[:3], img_sigma=1.0, world_sigma=0.1)
     full = p.world_points.new_full
@@ -55,6 +39,12 @@ def test_units_of_the_noise(make_problems):
     large = pose_covariance(scaled, 1000.0 * p.world_points, *p[1:3], img_sigma=1.0, world_sigma=100.0)
     unit = torch.tensor([1.0] * 3 + [1000.0] * 3, dtype=DOUBLE)
     torch.testing.assert_close(large, plain * unit * unit[:, None])
+    weights = (torch.arange(12) < 8).double().expand(5, 12)
+    world, sigma = p.world_points.clone(), torch.full((5, 12), 2.0, dtype=DOUBLE)
+    world[:, 8:], sigma[:, 8:] = torch.nan, torch.nan
+    half = pose_covariance(p.pose, world, *p[1:3], img_sigma=sigma, weights=weights)
+    part = pose_covariance(p.pose, p.world_points[:, :8], p.img_points[:, :8], p.intrinsics, img_sigma=2.0)
+    torch.testing.assert_close(half, part)
 
 
 @pytest.mark.parametrize(("camera", "noise"), [("pixels", "covariance"), *product(CAMERAS, ("sigma",))])
@@ -95,7 +85,7 @@ def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
     noise = {"img_sigma": 1.0, "world_sigma": 0.05}
     result = create_solver("pnpnet-set").double()(*p[:3], **noise)
     covariance = pose_covariance(result.pose, *p[:3], **noise, weights=result.weights)
-    error = tangent(result.pose, p.pose)
+    error = torch.cat((tangent(result.rotation @ p.pose.rotation.mT), result.translation - p.pose.translation), -1)
     for part, freedom, tolerance in ((slice(0, 6), 6.0, 0.06), (slice(0, 3), 3.0, 0.1), (slice(3, 6), 3.0, 0.1)):
         squares = (error[:, part] * torch.linalg.solve(covariance[:, part, part], error[:, part])).sum(-1)
         assert squares.mean().item() == pytest.approx(freedom, rel=tolerance)
@@ -106,10 +96,16 @@ def test_noise_that_nobody_gave_is_that_of_the_residuals(n, img_sigma, world_sig
     options = {"n": n, "batch_size": 500, "seed": 10, "dtype": DOUBLE}
     p = SyntheticProblems(img_sigma=img_sigma, world_sigma=world_sigma, **options).batch(0)
     result = create_solver("pnpnet-set").double()(*p[:3])
-    covariance = result.covariance(*p[:3])
-    error = tangent(result.pose, p.pose)[result.ok]
-    squares = (error * torch.linalg.solve(covariance[result.ok], error)).sum(-1)
-    assert squares.mean().item() == pytest.approx(6.0, rel=0.33)
+    error = torch.cat((tangent(result.rotation @ p.pose.rotation.mT), result.translation - p.pose.translation), -1)
+    for known in ({"world_sigma": world_sigma}, {}):
+        covariance = result.covariance(*p[:3], **known)
+        squares = (error * torch.linalg.solve(covariance, error)).sum(-1)[result.ok]
+        assert squares.mean().item() == pytest.approx(6.0, rel=0.33)
+        fewer = result._replace(inliers=result.inliers.index_fill(1, torch.arange(2), False))
+        found = fewer.covariance(*p[:3], **known)
+        assert found[result.ok].isfinite().all()
+        fewer, rest = fewer._replace(inliers=fewer.inliers[:, 2:]), (p.world_points[:, 2:], p.img_points[:, 2:])
+        torch.testing.assert_close(fewer.covariance(*rest, p.intrinsics, **known), found)
     alone = PnPResult(*(x[0] if isinstance(x, torch.Tensor) else x for x in result))
     torch.testing.assert_close(alone.covariance(*(x[0] for x in p[:3])), covariance[0])
 

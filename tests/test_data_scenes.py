@@ -172,19 +172,17 @@ class Bomb:
         return (pytest.fail, ("unpickled",))
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("R", np.zeros((2, 3, 3)), r"'R' has shape \(2, 3, 3\) of float64, expected numbers of \(1, 3, 3\)"),
-        ("000_img_points", np.zeros((20, 3)), r"'000_img_points' has shape \(20, 3\) .*\(any, 2\)"),
-        ("000_world_points", np.full((20, 3), "x"), "'000_world_points' .*expected numbers"),
-        ("t", np.full((1, 3), np.inf), "translation has values that are not finite"),
-        *(("R", factor * np.eye(3)[None], "not a rotation matrix") for factor in (2.0, -1.0)),
-        ("names", np.array([Bomb()], dtype=object), r"x.npz' cannot be used: not an NPZ file of numbers"),
-        ("size", np.array([[np.inf, 480]]), "'size' has numbers that are not positive"),
-        *((name, None, f"no array '{name}'") for name in ("names", "000_error_px")),
-    ],
-)
+WRONG = [("R", np.zeros((2, 3, 3)), r"'R' has shape \(2, 3, 3\) of float64, expected numbers of \(1, 3, 3\)")]
+WRONG += [("000_img_points", np.zeros((20, 3)), r"'000_img_points' has shape \(20, 3\) .*\(any, 2\)")]
+WRONG += [("000_world_points", np.full((20, 3), "x"), "'000_world_points' .*expected numbers")]
+WRONG += [("t", np.full((1, 3), np.inf), "translation has values that are not finite")]
+WRONG += [("R", factor * np.eye(3)[None], "not a rotation matrix") for factor in (2.0, -1.0)]
+WRONG += [("names", np.array([Bomb()], dtype=object), r"x.npz' cannot be used: not an NPZ file of numbers")]
+WRONG += [("size", np.array([[np.inf, 480]]), "'size' has numbers that are not positive")]
+WRONG += [(name, None, f"no array '{name}'") for name in ("names", "000_error_px")]
+
+
+@pytest.mark.parametrize(("key", "value", "message"), WRONG)
 def test_wrong_array(tmp_path, key, value, message):
     arrays = match_arrays(20) | {key: value}
     np.savez(tmp_path / "x.npz", **{name: array for name, array in arrays.items() if array is not None})

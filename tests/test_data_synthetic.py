@@ -179,23 +179,20 @@ def test_confidences_tell_inliers_from_outliers_more_or_less():
     assert set(p.known) == {"confidence"}
 
 
-def test_depth_maps_move_points_along_map_rays_and_make_outliers_of_flying_pixels():
+def test_depth_maps_move_points_along_map_rays_turn_them_together_and_make_outliers_of_flying_pixels():
     maps = partial(DepthMaps, depth_noise=(0.01, 0.011), angle=(1e-9, 2e-9))
-    clean, noisy = (draw(9, world_sigma=0.0, img_sigma=0.0, depth_maps=x) for x in (None, maps(flying_share=0.0)))
+    turning = DepthMaps(depth_noise=(1e-9, 2e-9), angle=(0.5, 0.51), flying_share=0.0, maps=1)
+    kinds = None, maps(flying_share=0.0), turning
+    clean, noisy, turned = (draw(9, world_sigma=0.0, img_sigma=0.0, depth_maps=x) for x in kinds)
     assert noisy.inliers.all()
     moves = (noisy.world_points - clean.world_points).norm(dim=-1)
     distance = clean.true_cam_points.norm(dim=-1)
     near, far = (moves[chosen].square().mean().sqrt() for chosen in (distance < 40, distance > 80))
     assert 2.5 < far / near < 7.0  # about the square of the distances' ratio
     assert abs(draw(9, depth_maps=maps(flying_share=0.2)).inliers.double().mean() - 0.8) < 0.01
-
-
-def test_a_map_turns_all_of_its_points():
-    maps = DepthMaps(depth_noise=(1e-9, 2e-9), angle=(0.5, 0.51), flying_share=0.0, maps=1)
-    clean, noisy = (draw(9, world_sigma=0.0, img_sigma=0.0, depth_maps=x) for x in (None, maps))
-    before, after = (torch.cdist(x.world_points, x.world_points) for x in (clean, noisy))
+    before, after = (torch.cdist(x.world_points, x.world_points) for x in (clean, turned))
     torch.testing.assert_close(before, after, rtol=1e-3, atol=1e-6)
-    assert (noisy.world_points - clean.world_points).norm(dim=-1).mean() > 0.1
+    assert (turned.world_points - clean.world_points).norm(dim=-1).mean() > 0.1
 
 
 def test_copies_are_whole_pairs_and_leave_eight_originals():

@@ -13,9 +13,7 @@ from torch import nn
 from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, pose_errors, success, success_rate
 from kornia_pnpnet.core.environment import environment
 from kornia_pnpnet.core.trees import iter_tensors, map_tensors
-from kornia_pnpnet.data import OutlierMix, SyntheticProblems
-from kornia_pnpnet.evaluation import comparison
-from kornia_pnpnet.evaluation import results as results_module
+from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
 from kornia_pnpnet.evaluation.bounds import KnownInliers
 from kornia_pnpnet.evaluation.comparison import EvaluationData, draw_problems, evaluate
 from kornia_pnpnet.evaluation.results import format_table, load_results, row_errors, save_results, source_digest
@@ -35,7 +33,7 @@ WRONG += [("rows.0.per_problem.ok", 1), ("data.clean.n", None)]
 @pytest.fixture(autouse=True)
 def _same_code(monkeypatch):
     """Keep the digest of the code fixed: the package may be edited while its tests run."""
-    monkeypatch.setattr(comparison, "source_digest", lambda: "the code")
+    monkeypatch.setattr("kornia_pnpnet.evaluation.comparison.source_digest", lambda: "the code")
 
 
 class _Fixed(nn.Module):
@@ -160,7 +158,7 @@ def test_the_wrong_entry_of_a_file_is_named(evaluated, place, value, path):
 
 
 def test_the_digest_of_the_code_covers_python_files_and_their_places(tmp_path, monkeypatch):
-    monkeypatch.setattr(results_module, "__file__", str(tmp_path / "evaluation" / "results.py"))
+    monkeypatch.setattr("kornia_pnpnet.evaluation.results.__file__", str(tmp_path / "evaluation" / "results.py"))
     digests = []
     for name, content in (("a.py", "b = 2"), ("a.py", "b = 3"), ("c.py", ""), ("notes.txt", "")):
         (tmp_path / name).write_text(content)
@@ -206,29 +204,26 @@ def test_solvers_and_sets_may_be_added(path):
 
 def other(function=lambda part: part, **changes):
     """Change the problems or a field of the data set ``clean``."""
-    return lambda _, data, patch: data.update(
-        clean=data["clean"]._replace(problems=map_tensors(function, data["clean"].problems), **changes)
-    )
+    changed = CLEAN["clean"]._replace(problems=map_tensors(function, CLEAN["clean"].problems), **changes)
+    return lambda _, data, __: data.update(clean=changed)
 
 
 def other_versions(solvers, data, patch):
     env = environment()
     env["versions"]["torch"] = "0.1"
-    patch.setattr(comparison, "environment", lambda: env)
-    patch.setattr(comparison, "source_digest", lambda: "other")
+    patch.setattr("kornia_pnpnet.evaluation.comparison.environment", lambda: env)
+    patch.setattr("kornia_pnpnet.evaluation.comparison.source_digest", lambda: "other")
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        (lambda solvers, *_: solvers.update(lm=lm(m=4)), r"lm\.config\.refine\.m was 3 and is 4"),
-        (lambda solvers, *_: solvers.update(lm=lm(seed=1)), r"lm\.weights was"),
-        *((lambda x, *_: x.pop("fixed"), r"solvers\.fixed\."), (lambda _, x, __: x.pop("clean"), r"data\.clean\.")),
-        (other(max_translation=0.1), r"clean\.max_translation was 0.2 and is 0.1"),
-        *((other(lambda part: part.flip(0)), r"clean\.digest was"), (other(as_double), r"clean\.dtype was")),
-        (other_versions, r"torch was .* and is '0\.1'; code was"),
-    ],
-)
+CHANGES = [(lambda solvers, *_: solvers.update(lm=lm(m=4)), r"lm\.config\.refine\.m was 3 and is 4")]
+CHANGES += [(lambda solvers, *_: solvers.update(lm=lm(seed=1)), r"lm\.weights was")]
+CHANGES += [(lambda x, *_: x.pop("fixed"), r"solvers\.fixed\."), (lambda _, x, __: x.pop("clean"), r"data\.clean\.")]
+CHANGES += [(other(max_translation=0.1), r"clean\.max_translation was 0.2 and is 0.1")]
+CHANGES += [(other(lambda part: part.flip(0)), r"clean\.digest was"), (other(as_double), r"clean\.dtype was")]
+CHANGES += [(other_versions, r"torch was .* and is '0\.1'; code was")]
+
+
+@pytest.mark.parametrize(("change", "named"), CHANGES)
 def test_rows_of_another_evaluation_are_refused(path, monkeypatch, change, named):
     solvers, data = {"lm": lm(), "fixed": _Fixed()}, dict(SETS)
     evaluate(solvers, data, path=path)
@@ -246,7 +241,7 @@ def test_rows_of_another_machine_name_it(path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         evaluate({"first": _Fixed(), "second": _Fixed(calls=0)}, CLEAN, path=path)
     env = {**environment(), "cpu": "an abacus", "threads": 100, "date": "tomorrow"}
-    monkeypatch.setattr(comparison, "environment", lambda: env)
+    monkeypatch.setattr("kornia_pnpnet.evaluation.comparison.environment", lambda: env)
     first, second = evaluate({"first": _Fixed(), "second": _Fixed()}, CLEAN, path=path)["rows"]
     assert "environment" not in first
     assert second["environment"] == {"cpu": "an abacus", "threads": 100}
@@ -278,7 +273,7 @@ def test_only_our_solvers_get_the_noise_level():
         given.clear()
 
 
-def test_a_solver_for_another_n_is_left_out(path):
+def test_a_solver_for_another_n_or_that_takes_no_rigs_is_left_out(path):
     data = {str(n): EvaluationData(draw_problems(SyntheticProblems(n=n, batch_size=10), 10)) for n in (6, 9)}
     for _ in range(2):  # the second time from the file
         results = evaluate({"nine": lm(), "any": _Fixed()}, data, path=path)
@@ -287,6 +282,9 @@ def test_a_solver_for_another_n_is_left_out(path):
         assert (entry["data"], entry["solver"]) == ("6", "nine")
         assert "n = 9" in entry["reason"]
         assert load_results(path) == results
+    rigs = {"rigs": EvaluationData(CameraProblems(n=12, batch_size=10, cameras=3).batch(0))}
+    results = evaluate({"start": create_solver("identity-lm"), "any": create_solver("epnp-lm")}, rigs)
+    assert (names(results), results["left_out"][0]["solver"]) == ([("rigs", "any")], "start")
 
 
 def test_an_error_says_where_it_was_and_keeps_the_rows(path):

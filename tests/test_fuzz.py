@@ -512,15 +512,6 @@ def test_the_first_calls_of_each_function_keep_the_laws(name):
         check(draw(seed), seed, law)
 
 
-def text(call: Call) -> str:
-    """The call with the forms of its tensors."""
-
-    def form(x: Tensor) -> str:
-        return f"{x.dtype} {[*x.shape]} {x.stride()}" + " with gradient" * x.requires_grad
-
-    return str(call._replace(args=mapped(form, call.args)))
-
-
 def main(minutes: int = 60, *seeds: int) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
@@ -531,7 +522,9 @@ def main(minutes: int = 60, *seeds: int) -> None:
             outcomes["calls keep the laws"] += 1
         except Exception:
             outcomes["calls fail"] += 1
-            print(f"\nseed {seed}: {text(draw(seed))}\n{traceback.format_exc(limit=None if seeds else -2)}", flush=True)
+            call = draw(seed)
+            call = call._replace(args=mapped(lambda x: (x.dtype, x.shape, x.stride(), x.requires_grad), call.args))
+            print(f"\nseed {seed}: {call}\n{traceback.format_exc(limit=None if seeds else -2)}", flush=True)
     print(dict(outcomes))
 
 

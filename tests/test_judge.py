@@ -8,7 +8,6 @@ import pytest
 import torch
 from doubtful import INTRINSICS, doubtful
 from kornia.core.exceptions import BaseError
-from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import PnPNet, Pose, Status, create_solver, diagnose, gravity_prior, p3p, pose_errors, success
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
@@ -168,7 +167,7 @@ def test_probability_tells_sound_problems_from_random_pixels(effort, sigmas):
 def test_probability_is_observed_as_often():
     p = SyntheticProblems(n=12, batch_size=1500, seed=5, outliers=OutlierMix(max_ratio=0.8)).batch(0)
     result = create_solver("pnpnet-set")(*p[:3])
-    depth = transform_points(p.pose.matrix, p.world_points)[..., 2].median(1).values
+    depth = p.true_cam_points[..., 2].median(1).values
     found, true = (-(x.rotation.mT @ x.translation[..., None])[..., 0] for x in (result.pose, p.pose))  # centres
     near = pose_errors(result.pose, p.pose).rotation_error_deg <= 10
     near &= (found - true).norm(dim=-1) <= 0.3 * depth
@@ -254,7 +253,6 @@ def test_a_pose_is_not_believed_beside_its_mirror_image(generator):
         result = create_solver("pnpnet-set", effort=effort)(*given)
         error = pose_errors(result.pose, pose).rotation_error_deg
         believed[effort] = result.ok[error > 10.0].double().mean(), result.ok[error < 5.0].double().mean()
-        assert (result.status[~result.ok] != 0).all()
         assert (result.probability[result.ok] >= LEAST_PROBABILITY).all()
     assert believed["fixed"][0] > 0.5
     assert believed["adaptive"][0] < 0.5
@@ -301,11 +299,9 @@ def test_gravity_chooses_between_mirror_images(generator):
     *given, pose = boards(generator, batch=300, tilt=40.0, sigma=1.0)
     down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand(300, 3)
     prior = gravity_prior(down, (pose.rotation @ down[..., None])[..., 0], 0.05)
-    result = create_solver("pnpnet-set")(*given, prior=prior, img_sigma=1.0, world_sigma=0.0)
-    others = create_solver("pnpnet-set")(
-        *given, prior=prior, img_sigma=1.0, world_sigma=0.0, alternatives=1
-    ).alternatives
-    assert (others.probability < 0.1).double().mean() > 0.9
+    known = {"prior": prior, "img_sigma": 1.0, "world_sigma": 0.0}
+    result, more = (create_solver("pnpnet-set")(*given, **known, alternatives=number) for number in (0, 1))
+    assert (more.alternatives.probability < 0.1).double().mean() > 0.9
     close = pose_errors(result.pose, pose).rotation_error_deg < 10.0
     assert close.double().mean() > 0.98
     assert result.ok[close].double().mean() > 0.9

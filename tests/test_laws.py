@@ -30,6 +30,8 @@ QUICK = [
 FEW_GRADIENTS = [Case("identity-lm", *x) for x in ([], ["rig", "covariance"], ["pixels", "sigma", "unknown"])]
 FEW_GRADIENTS += [Case("identity-lm", extra="prior"), Case("identity-lm", focal="unknown", extra="radial")]
 GRADIENTS = [Case("identity-lm", *x) for x in product(CAMERAS, NOISES, FOCALS)]
+POINTS = st.sampled_from([None, data.BoxPoints(), data.SlabPoints(), data.DrivePoints()])
+MIXES = st.sampled_from([{}, {"count": 2}, {"max_ratio": 0.5, "mismatch_share": 0.5}])
 
 
 def params(laws, quick, cases):
@@ -49,12 +51,7 @@ def test_law(law, case):
 
 
 @many(60)
-@given(
-    st.sampled_from([None, data.BoxPoints(), data.SlabPoints(), data.DrivePoints()]),
-    st.integers(4, 15),
-    st.integers(0, 1000),
-    st.sampled_from([{}, {"count": 2}, {"max_ratio": 0.5, "mismatch_share": 0.5}]),
-)
+@given(POINTS, st.integers(4, 15), st.integers(0, 1000), MIXES)
 def test_both_precisions_see_the_same_problems(points, n, seed, outliers):
     options = {"n": n, "batch_size": 3, "seed": seed, "outliers": data.OutlierMix(**outliers)}
     if points is None:

@@ -236,8 +236,7 @@ def test_hypotheses_find_other_modes():
     arguments = (world, p.img_points, p.intrinsics)
     options = {"img_sigma": 2.0, "kernel": "truncated", "scale": 4.0, "samples": 600, "rounds": 0}
     torch.manual_seed(0)
-    one = monte_carlo_pose_loss(p.pose, [], *arguments, **options)
-    two = monte_carlo_pose_loss(p.pose, other, *arguments, **options)
+    one, two = (monte_carlo_pose_loss(p.pose, x, *arguments, **options) for x in ([], other))
     first, second = (
         pose_covariance(pose, *arguments, img_sigma=2.0, weights=share.expand(4, 40)).logdet()
         for pose, share in ((p.pose, even), (other, 1.0 - even))

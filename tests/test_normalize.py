@@ -5,7 +5,6 @@ import itertools
 import pytest
 import torch
 from kornia.geometry.conversions import denormalize_points_with_intrinsics
-from kornia.geometry.linalg import transform_points
 
 from kornia_pnpnet import Normalize, Pose
 from kornia_pnpnet.frame import F_CONST
@@ -28,7 +27,7 @@ def test_poses_go_to_the_frame_of_the_points_and_back_for_any_camera(fx, fy, cx,
     rays = p.img_points / p.intrinsics[:, 0, 0, None, None]
     img_points = denormalize_points_with_intrinsics(rays, K)
     problem, frame = Normalize(f_const=f_const, **options)(p.world_points, img_points, K)
-    cam = transform_points(p.pose.matrix, p.world_points)
+    cam = p.true_cam_points
     pixels, expected = f_const * rays, f_const * (cam[..., :2] / cam[..., 2:] - rays)
     if frame.order is not None:
         pixels, expected = (x.gather(1, frame.order[..., None].expand(-1, -1, 2)) for x in (pixels, expected))

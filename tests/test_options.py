@@ -99,14 +99,12 @@ PRIORS = (data.BoxPoints, data.FacadePoints, data.RoomPoints, data.DrivePoints)
 #: Whose options are drawn, what is made with them, and what the product must do.
 CASES = [
     *((part, part, solves) for part in SOLVER_PARTS),
-    (MLPInit, lambda n=9, **sizes: MLPInit(n, **sizes), solves),
-    (RANSAC, partial(RANSAC, P3P()), solves),
+    *((MLPInit, lambda n=9, **sizes: MLPInit(n, **sizes), solves), (RANSAC, partial(RANSAC, P3P()), solves)),
     *((PnPNet, partial(create_solver, name), solves) for name in ("pnpnet-set", "pnpnet-n9", "p3p-ransac", "epnp-lm")),
     *((loss, loss, costs) for loss in (PoseLoss, SetLoss)),
     *((points, partial(with_points, points), is_sound) for points in PRIORS),
     (data.MixedPoints, partial(with_points, partial(data.MixedPoints, [data.BoxPoints()] * 2)), is_sound),
-    (data.SyntheticProblems, synthetic, is_sound),
-    (data.SceneProblems, from_scene, is_sound),
+    *((data.SyntheticProblems, synthetic, is_sound), (data.SceneProblems, from_scene, is_sound)),
     (data.OutlierMix, lambda **values: synthetic(outliers=data.OutlierMix(**values)), is_sound),
     (data.OutlierMix, lambda **values: from_scene(outliers=data.OutlierMix(**values)), is_sound),
     (data.VaryingSize, mixture, is_sound),
@@ -142,24 +140,19 @@ def test_any_options_work_or_are_refused(constructor, make, use):
 REFUSED = [
     (RobustWeightedLM, {"kernel": "tukey", "update": "se3", "backward": "truncated", "step": 2.1, "damping": 0.0}),
     (RobustWeightedLM, {"robustness": 3.5, "m": -1, "by_residual": True}),
-    (RobustWeightedLM, {"m": 2.5, "by_residual": -1}),
+    *((RobustWeightedLM, {"m": 2.5, "by_residual": -1}), (PnPNet, {"views": 9, "gradient": "never"})),
     (PnPNet, {"views": 0, "focal": "free", "focal_sigma": 0.1, "radial": 1, "effort": "adaptive"}),
-    (PnPNet, {"views": 9, "gradient": "never"}),
     (partial(PnPNet, focal="unknown"), {"views": True, "focal_sigma": 1e-20, "radial": 3}),
-    *((MLPInit, {"n": n}) for n in (2, "9")),
-    (SetInit, {"width": 0, "starts": 0, "layers": 1.5, "samples": 9}),
-    (partial(SetInit, width=30), {"heads": 4}),
-    (EPnP, {"iterations": 1, "algebraic_weight": -0.1}),
+    *((MLPInit, {"n": 2}), (MLPInit, {"n": "9"}), (SetInit, {"width": 0, "starts": 0, "layers": 1.5, "samples": 9})),
+    *((partial(SetInit, width=30), {"heads": 4}), (EPnP, {"iterations": 1, "algebraic_weight": -0.1})),
     (REPPnP, {"quantile": 1.1, "max_error": -1.0, "refine_iterations": 0}),
     (partial(RANSAC, P3P()), {"threshold": math.nan, "world_threshold": -1.0, "scorer": "best", "max_samples": 0}),
     (partial(RANSAC, P3P()), {"min_samples": 1.5, "confidence": 1.0, "final_steps": -1}),
-    (partial(SubsetSolver, EPnP()), {"size": 2}),
     (OpenCVRansac, {"threshold": math.inf, "iterations": 0, "confidence": 1.0, "seed": -1, "refine": 1}),
-    (OpenCVPnP, {"method": "NOPE"}),
+    *((partial(SubsetSolver, EPnP()), {"size": 2}), (KnownInliersAndNoise, {"img_sigma": -1.0})),
     *((OpenCVUsac, {"method": method}) for method in ("USAC_FM_8PTS", "SOLVEPNP_EPNP")),
     (KorniaRs, {"threshold": math.inf, "max_iterations": 0, "method": "P3P"}),
-    (PoseLib, {"threshold": -1.0, "min_iterations": 0}),
-    (PyColmap, {"loss_scale": 0.0, "max_iterations": 50}),
+    *((PoseLib, {"threshold": -1.0, "min_iterations": 0}), (PyColmap, {"loss_scale": 0.0, "max_iterations": 50})),
     (data.OutlierMix, {"max_ratio": 1.5, "count": -1, "min_count": -1, "mismatch_share": 2.0}),
     (data.OutlierMix, {"near_pixels": (3.0, 1.0), "structured_ratio": (0.0, 0.5), "crowd_share": 1.1, "max_crowds": 0}),
     (data.OutlierMix, {"structured_angle": -1.0, "mirrored_share": 1.5}),
@@ -169,8 +162,7 @@ REFUSED = [
     (data.SyntheticProblems, {"img_sigma": (2.0, 1.0), "world_sigma": (1.0, 2.0, 3.0)}),
     (data.CameraProblems, {"n": 0, "field_of_view": (90.0, 30.0), "outlier_share": 2.0, "cameras": 0}),
     (data.CameraProblems, {"field_of_view": (0.0, 30.0), "depth_spread": 0.5}),
-    (KnownInliersAndNoise, {"img_sigma": -1.0}),
-    (partial(KnownInliersAndNoise, world_sigma=0.0), {"img_sigma": 0.0}),
+    *((OpenCVPnP, {"method": "NOPE"}), (partial(KnownInliersAndNoise, world_sigma=0.0), {"img_sigma": 0.0})),
     (partial(data.SceneProblems, make_scene(20)), {"n": 0, "batch_size": 0, "num_spares": 0}),
 ]
 
@@ -203,9 +195,8 @@ covariance = partial(k.pose_covariance, POSES, POINTS, PIXELS, CAMERA)
 likelihood = partial(k.monte_carlo_pose_loss, POSES, POSES, world_points=POINTS, img_points=PIXELS, intrinsics=CAMERA)
 #: Calls with a wrong argument of the functions beside the solvers.
 WRONG = [partial(bearings, x, CAMERA) for x in (PIXELS[..., :1], torch.zeros(2, 5, 3), PIXELS[0, 0])]
-WRONG += [partial(bearings, PIXELS[0], CAMERA[None])]
+WRONG += [partial(bearings, PIXELS[0], CAMERA[None]), partial(bearings, PIXELS[0], CAMERA, fisheye=torch.zeros(1, 4))]
 WRONG += [partial(bearings, PIXELS, CAMERA, dist=torch.zeros(5, 4)), partial(lifted, img_points=torch.zeros(2, 5, 3))]
-WRONG += [partial(bearings, PIXELS[0], CAMERA, fisheye=torch.zeros(1, 4))]
 WRONG += [partial(lifted, img_sigma=1.0, img_cov=torch.zeros(2, 5, 2, 2))]
 WRONG += [partial(lifted, **x) for x in ({"depth": 2.0}, {"depth": torch.ones(2, 5, 1)}, {"depth_sigma": None})]
 WRONG += [partial(k.heatmap_keypoints, x) for x in (torch.zeros(1, 2, 0, 5), torch.zeros(4, 4), MAPS > 0)]

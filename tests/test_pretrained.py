@@ -30,16 +30,14 @@ from kornia_pnpnet.training.results import find_results, load_run, summarize_run
 FLOORS = {6: (0.67, 0.53), 9: (0.85, 0.77), 12: (0.92, 0.87), 20: (0.97, 0.95)}
 # Of the one set of weights for any rotation and any number of pairs.
 SET_FLOORS = {6: (0.71, 0.55), 9: (0.88, 0.79), 12: (0.94, 0.89), 20: (0.98, 0.97), 50: (0.99, 0.99)}
+CASES = [(f"pnpnet-n{n}", n, floors, torch.float64) for n, floors in FLOORS.items()]
+CASES += [("pnpnet-set", n, floors, torch.float32) for n, floors in SET_FLOORS.items()]
+CASES += [("pnpnet-n9", 9, FLOORS[9], torch.float32)]
+#: Options that are too large.
+LARGE = [("init", "width", 2**17), ("init", "layers", 10**7), ("refine", "m", 10**9), ("refine", "by_residual", 10**12)]
 
 
-@pytest.mark.parametrize(
-    ("name", "n", "floors", "dtype"),
-    [
-        ("pnpnet-n9", 9, FLOORS[9], torch.float32),
-        *((f"pnpnet-n{n}", n, floors, torch.float64) for n, floors in FLOORS.items()),
-        *(("pnpnet-set", n, floors, torch.float32) for n, floors in SET_FLOORS.items()),
-    ],
-)
+@pytest.mark.parametrize(("name", "n", "floors", "dtype"), CASES)
 def test_success_on_problems_that_nothing_else_uses(name, n, floors, dtype):
     common = {"n": n, "batch_size": 4000, "dtype": dtype} | ({"max_angle": math.pi} if name == "pnpnet-set" else {})
     solver, sound = create_solver(name), SyntheticProblems(seed=555_001, **common).batch(0)
@@ -89,10 +87,7 @@ def test_shipped_weights_have_a_checksum_and_the_card_of_their_run(name, tmp_pat
         assert "sha256" in file.metadata()  # which loading compares: `test_damaged_weights_load_nothing`
 
 
-@pytest.mark.parametrize(
-    ("part", "name", "value"),
-    [("init", "width", 2**17), ("init", "layers", 10**7), ("refine", "m", 10**9), ("refine", "by_residual", 10**12)],
-)
+@pytest.mark.parametrize(("part", "name", "value"), LARGE)
 def test_weights_that_are_not_finite_or_of_another_size_are_refused(part, name, value, tmp_path):
     config, state = read_weights("pnpnet-set")
     config[part][name] = value

@@ -5,7 +5,6 @@ import torch
 from helpers import finite, rate
 
 from kornia_pnpnet import Pose, create_solver, pose_errors, success
-from kornia_pnpnet.core import linalg
 from kornia_pnpnet.core.linalg import align, nearest_rotation, solve_leading, solve_positive
 from kornia_pnpnet.core.symmetric import are_semi_definite, equivalent_sigma, symmetric
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
@@ -136,7 +135,7 @@ def test_a_plane_parallel_to_the_image_has_a_gradient(plane):
 @pytest.fixture(params=[True, False], ids=["few", "many"])
 def few(request, monkeypatch):
     """Whether functions that have a form for few problems and one for many use the first one."""
-    monkeypatch.setattr(linalg, "are_few", lambda _: request.param)
+    monkeypatch.setattr("kornia_pnpnet.core.linalg.are_few", lambda _: request.param)
 
 
 EASY = [(1, 1, 1), (3, 2, 1), (3, 2, 0), (3, 2, -1), (1, 1e-3, 1e-6)]

@@ -21,12 +21,10 @@ import pandas as pd
 from matplotlib import pyplot
 from rates import Rates, compare_all, compared
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
+from kornia_pnpnet import MLPInit, PnPNet, RobustWeightedLM, create_solver, success_rate
 from kornia_pnpnet.core.environment import BEHAVIOUR
 from kornia_pnpnet.data import SyntheticProblems
 from kornia_pnpnet.evaluation import EvaluationData, evaluate, plots
-from kornia_pnpnet.metrics import success_rate
-from kornia_pnpnet.propose.mlp import MLPInit
 
 
 @pytest.fixture(scope="module")
@@ -140,9 +138,8 @@ def test_dots_stand_in_their_rows_at_their_rates(draw, drawn):
 def test_scenes_are_pooled_over_all_their_problems(draw):
     rows = [("a", "none", 9, "epnp", 30), ("b", "none", 9, "epnp", 10), ("a", "none", 9, "mine", 1)]
     rows += [("a", 2, 9, "epnp", 5), ("a", 3, 9, "epnp", 7)]
-    pooled, first, _, spoilt = (
-        {name: [round(x) for x, _ in dots] for name, dots in panel.items()} for panel in draw("figure4", rows)
-    )
+    panels = draw("figure4", rows)
+    pooled, first, _, spoilt = ({name: [round(x) for x, _ in dots] for name, dots in panel.items()} for panel in panels)
     assert pooled == {"epnp": [20]}  # the other solver solved one scene only
     assert first == {"epnp": [30], "mine": [1]}
     assert spoilt == {"epnp": [5]}
@@ -332,47 +329,39 @@ def flops(**counts):
     return sum(OPERATION_COSTS[kind] * count for kind, count in counts.items())
 
 
-@pytest.mark.parametrize(
-    ("function", "expected"),
-    [
-        *((lambda x: 3 - x, flops(add=12)), (lambda x: torch.add(x, x, alpha=3), flops(add=12, multiply=12))),
-        *((lambda x: x[:, None] * x[None], flops(multiply=3 * 3 * 4)), (lambda x: x.min(-1), flops(compare=9))),
-        *((lambda x: x.rsqrt(), flops(sqrt=12, divide=12)), (lambda x: x.exp_(), flops(exp=12))),
-        (lambda x: x.sin() + x.log(), flops(log=24, add=12)),
-        *((lambda x: x.abs() > 1, flops(compare=36)), (lambda x: x.clamp(min=0, max=1), flops(compare=24))),
-        (lambda x: torch.where(x > 1, x, 0.0), flops(compare=12, logic=12)),
-        (lambda x: torch.addcmul(x, x, x, value=2), flops(add=12, multiply=24)),
-        (lambda x: x**5, flops(multiply=36)),  # x² twice, times x
-        *((lambda x: x**-2, flops(multiply=12, divide=12)), (lambda x: x**1.5, flops(sqrt=12, multiply=12))),
-        (lambda x: x**0.3, flops(exp=12, log=12, multiply=12)),
-        *((lambda x: x.mean(-1), flops(add=9, divide=3)), (lambda x: x.cumsum(-1), flops(add=9))),
-        (lambda x: torch.linalg.vector_norm(x, dim=(0, 1)), flops(add=11, multiply=12, sqrt=1)),
-        (lambda x: x.softmax(-1), flops(add=12 + 9, divide=12, exp=12, compare=9)),
-        (
-            lambda x: torch.nn.functional.layer_norm(x, (4,), x[0], x[1]),  # sums, differences, squares
-            3 * flops(add=3 + 4 + 3 + 1 + 4, multiply=4 + 4 + 4, divide=3, sqrt=1),
-        ),
-        (lambda x: (x > 0).all(-1), flops(compare=12, logic=9)),
-        (lambda x: x.sort(0), flops(compare=4 * 3 * math.log2(3))),
-        *((lambda x: x.topk(2), flops(compare=3 * (6 + 2))), (lambda x: x.topk(2, sorted=False), flops(compare=3 * 6))),
-        *((lambda x: x.kthvalue(3), flops(compare=3 * 5)), (lambda x: x.nanmedian(-1), flops(compare=3 * (4 + 6)))),
-        (lambda x: (-x).T.reshape(2, 6).flip(0).clone()[:, [0, 1]], 0),
-    ],
-)
+NORM = 3 * flops(add=3 + 4 + 3 + 1 + 4, multiply=4 + 4 + 4, divide=3, sqrt=1)  # sums, differences, squares
+#: Functions of a matrix of 3 by 4, and what they cost; the fifth power is x² twice, times x.
+COSTS = [(lambda x: 3 - x, flops(add=12)), (lambda x: torch.add(x, x, alpha=3), flops(add=12, multiply=12))]
+COSTS += [(lambda x: x[:, None] * x[None], flops(multiply=3 * 3 * 4)), (lambda x: x.min(-1), flops(compare=9))]
+COSTS += [(lambda x: x.rsqrt(), flops(sqrt=12, divide=12)), (lambda x: x.exp_(), flops(exp=12))]
+COSTS += [(lambda x: x.sin() + x.log(), flops(log=24, add=12)), (lambda x: x.abs() > 1, flops(compare=36))]
+COSTS += [(lambda x: x.clamp(min=0, max=1), flops(compare=24))]
+COSTS += [(lambda x: torch.where(x > 1, x, 0.0), flops(compare=12, logic=12))]
+COSTS += [(lambda x: torch.addcmul(x, x, x, value=2), flops(add=12, multiply=24)), (lambda x: x**5, flops(multiply=36))]
+COSTS += [(lambda x: x**-2, flops(multiply=12, divide=12)), (lambda x: x**1.5, flops(sqrt=12, multiply=12))]
+COSTS += [(lambda x: x**0.3, flops(exp=12, log=12, multiply=12))]
+COSTS += [(lambda x: x.mean(-1), flops(add=9, divide=3)), (lambda x: x.cumsum(-1), flops(add=9))]
+COSTS += [(lambda x: torch.linalg.vector_norm(x, dim=(0, 1)), flops(add=11, multiply=12, sqrt=1))]
+COSTS += [(lambda x: x.softmax(-1), flops(add=12 + 9, divide=12, exp=12, compare=9))]
+COSTS += [(lambda x: torch.nn.functional.layer_norm(x, (4,), x[0], x[1]), NORM)]
+COSTS += [(lambda x: (x > 0).all(-1), flops(compare=12, logic=9))]
+COSTS += [(lambda x: x.sort(0), flops(compare=4 * 3 * math.log2(3)))]
+COSTS += [(lambda x: x.topk(2), flops(compare=3 * (6 + 2))), (lambda x: x.topk(2, sorted=False), flops(compare=3 * 6))]
+COSTS += [(lambda x: x.kthvalue(3), flops(compare=3 * 5)), (lambda x: x.nanmedian(-1), flops(compare=3 * (4 + 6)))]
+COSTS += [(lambda x: (-x).T.reshape(2, 6).flip(0).clone()[:, [0, 1]], 0)]
+ALGEBRA = [(lambda a, b: a @ b, [(5, 6, 2, 3), (6, 3, 4)], 30 * operations.matmul(2, 3, 4))]
+ALGEBRA += [(torch.nn.functional.linear, [(5, 3), (4, 3), (4,)], 5 * flops(multiply=12, add=12))]
+ALGEBRA += [(torch.cdist, [(5, 2, 3), (5, 4, 3)], 40 * flops(add=3 + 2, multiply=3, sqrt=1))]
+ALGEBRA += [(torch.linalg.inv_ex, [(5, 4, 4)], 5 * operations.solve(4, 4))]
+ALGEBRA += [(torch.linalg.cholesky_ex, [(5, 4, 4)], 5 * operations.cholesky(4))]
+
+
+@pytest.mark.parametrize(("function", "expected"), COSTS)
 def test_cost_of_an_operation(function, expected):
     assert count(function, (3, 4)) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("function", "shapes", "expected"),
-    [
-        (lambda a, b: a @ b, [(5, 6, 2, 3), (6, 3, 4)], 30 * operations.matmul(2, 3, 4)),
-        (torch.nn.functional.linear, [(5, 3), (4, 3), (4,)], 5 * flops(multiply=12, add=12)),
-        (torch.cdist, [(5, 2, 3), (5, 4, 3)], 40 * flops(add=3 + 2, multiply=3, sqrt=1)),
-        (torch.linalg.inv_ex, [(5, 4, 4)], 5 * operations.solve(4, 4)),
-        (torch.linalg.cholesky_ex, [(5, 4, 4)], 5 * operations.cholesky(4)),
-    ],
-)
+@pytest.mark.parametrize(("function", "shapes", "expected"), ALGEBRA)
 def test_cost_of_linear_algebra(function, shapes, expected):
     assert count(function, *shapes) == expected
 

@@ -20,7 +20,6 @@ from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.core.trees import iter_tensors
 from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
-from kornia_pnpnet.pretrained import shipped_weights
 from kornia_pnpnet.propose.epnp import EPnP
 
 
@@ -88,8 +87,7 @@ def test_fitted_confidences_find_poses_among_many_outliers(generator):
     confidences = {"none": None, "raw": 1.0 - scores, "fitted": (inlier / (inlier + outlier)).clamp(0.01, 0.99)}
     solver, rates = create_solver("p3p-ransac", max_samples=300), {}
     for name, confidence in confidences.items():
-        with torch.no_grad():
-            rates[name] = rate(solver(*problems[:3], confidence=confidence), problems, max_translation=0.5)
+        rates[name] = rate(solver(*problems[:3], confidence=confidence), problems, max_translation=0.5)
     assert rates["fitted"] > rates["none"] + 0.15, rates
     assert rates["fitted"] > rates["raw"] + 0.05, rates
 
@@ -106,8 +104,7 @@ def test_confidence_is_at_least_as_good_as_weights_made_of_it(power, generator):
     pixels = torch.where(inliers[..., None], pixels, elsewhere)
     errors = {}
     for name, values in {"confidence": confidence, "weights": confidence**6, "mask": inliers | True}.items():
-        with torch.no_grad():
-            found = create_solver("pnpnet-set")(problems[0], pixels, problems[2], **{name: values})
+        found = create_solver("pnpnet-set")(problems[0], pixels, problems[2], **{name: values})
         errors[name] = k.pose_errors(found.pose, problems.pose).rotation_error_deg.clamp(max=10.0).mean()
     assert errors["confidence"] < errors["weights"]
     assert errors["confidence"] < 1.02 * errors["mask"]
@@ -235,10 +232,8 @@ def test_a_given_matrix_becomes_the_nearest_rotation(make_problems, generator):
     left, _, right = torch.linalg.svd(changed)
     given, nearest = (Pose(x, p.pose.translation) for x in (changed, left @ right))
     known = torch.eye(6).double().expand(7, 6, 6)
-    for found, expected in (
-        (solver(*p[:3], init=given), solver(*p[:3], init=nearest)),
-        (solver(*p[:3], prior=k.PosePrior(given, known)), solver(*p[:3], prior=k.PosePrior(nearest, known))),
-    ):
+    for option in (lambda x: {"init": x}, lambda x: {"prior": k.PosePrior(x, known)}):
+        found, expected = (solver(*p[:3], **option(x)) for x in (given, nearest))
         assert found.ok.all()
         assert_same(found.pose, expected.pose, 1e-9, 1e-9)
         assert_same(found.init, nearest, 1e-9, 1e-9)
@@ -368,7 +363,7 @@ def test_a_data_loader_returns_results_and_loaded_weights_can_be_trained(name):
     solve = partial(_solve_each, create_solver(name), SyntheticProblems(n=9, batch_size=4, seed=0).batch(0))
     result = next(iter(DataLoader(range(4), batch_size=4, num_workers=1, collate_fn=solve)))
     assert result.rotation.shape == (4, 3, 3)
-    if name in shipped_weights():
+    if name in k.shipped_weights():
         assert all(x.requires_grad for x in PnPNet.from_pretrained(name).parameters())
 
 

@@ -25,6 +25,8 @@ from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError
 
 SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
+#: Signals, and the numbers of workers before and after.
+SIGNALS = [(signal.SIGTERM, 0, 0), (signal.SIGINT, 1, 0), (signal.SIGINT, 0, 1), (signal.SIGTERM, 1, 1)]
 
 # Python 3.12 warns of every fork of a process with threads, which pytest-xdist's are.
 pytestmark = forks = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
@@ -75,10 +77,7 @@ def stopping_loss(at, number):
     return LossWith(stop, at=(at,))
 
 
-@pytest.mark.parametrize(
-    ("number", "workers", "workers_later"),
-    [(signal.SIGTERM, 0, 0), (signal.SIGINT, 1, 0), (signal.SIGINT, 0, 1), (signal.SIGTERM, 1, 1)],
-)
+@pytest.mark.parametrize(("number", "workers", "workers_later"), SIGNALS)
 def test_resuming_after_a_signal_equals_not_stopping(tmp_path, number, workers, workers_later):
     if workers and sys.platform == "win32":
         pytest.skip("os.kill ends the workers")

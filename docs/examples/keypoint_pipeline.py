@@ -215,7 +215,7 @@ def train(
     The loss is that of the keypoints; the way "end to end" adds that of the pose, and "likelihood" that of the noise,
     from which keypoints get no gradient. In the way "hidden" the hidden keypoints have labels, too.
     """
-    log: list[list[float]] = []
+    log: list[float] = []
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=len(updates), pct_start=0.1)
     for index in updates:
@@ -224,7 +224,7 @@ def train(
         off = functional.smooth_l1_loss(pixels, problem.pixels, reduction="none").mean(-1)
         labelled = torch.ones_like(problem.visible) if "hidden" in way else problem.visible
         loss = (off * labelled).sum() / labelled.sum()
-        terms = [loss.item()]
+        log.append(loss.item())
         if "likelihood" in way:
             loss = loss + (surprise((pixels - problem.pixels).detach(), noise) * labelled).sum() / labelled.sum()
         if "end to end" in way:
@@ -233,16 +233,12 @@ def train(
             counts = result.ok & (error.detach() < 10.0 * MOST)
             # Saturated, because a pose that is far off says little about pixels.
             loss = loss + POSE_WEIGHT * torch.where(counts, error / (1.0 + error / MOST), 0.0).mean()
-            terms.append(error.detach().median().item())
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
         schedule.step()
-        log.append(terms)
-    curves = torch.stack([x.mean(0) for x in torch.tensor(log).split(MEAN_OF)]).T.tolist()
-    rounded = ([round(x, 5) for x in curve] for curve in curves)
-    return dict(zip(("keypoint_loss", "median_distance"), rounded, strict=False))
+    return {"keypoint_loss": [round(x.mean().item(), 5) for x in torch.tensor(log).split(MEAN_OF)]}
 
 
 @torch.no_grad()

@@ -1,14 +1,16 @@
 """Serve single problems from several threads, one by one or gathered into batches: ``python docs/examples/serve.py``.
 
 Clients call a server at the same time. ``Server`` solves all waiting problems in one call. Compares its latencies with
-clients that call the solver themselves, and with PyTorch's default number of threads. Writes `serve.json` to `--out`.
+clients that call the solver or, with `--package`, a package themselves. Writes `serve.json` to `--out`.
 """
 
+import itertools
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from queue import SimpleQueue
-from threading import Thread
+from threading import Thread, local
 from typing import Any
 
 import torch
@@ -19,8 +21,9 @@ from torch.nn.utils.rnn import pad_sequence
 from kornia_pnpnet import PnPResult, create_solver
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.data import OutlierMix, SyntheticProblems
+from kornia_pnpnet.export import load_package
 
-Solve = Callable[..., PnPResult]
+Solve = Callable[..., Any]
 
 
 class Server:
@@ -59,6 +62,17 @@ class Server:
                     future.set_exception(error)
 
 
+class Packaged(local):
+    """A package of one problem per call. Each thread loads it once."""
+
+    def __init__(self, path: Path) -> None:
+        self.solver = load_package(path)
+
+    def __call__(self, *pairs: Tensor) -> Any:
+        """Solve one problem."""
+        return self.solver(*(x[None] for x in pairs))
+
+
 def latencies(solve: Solve, problems: list[tuple[Tensor, ...]], clients: int) -> dict[str, float]:
     """Milliseconds of a call, and problems per second, with clients that call at the same time."""
 
@@ -78,17 +92,19 @@ def latencies(solve: Solve, problems: list[tuple[Tensor, ...]], clients: int) ->
 
 
 def main() -> None:
-    options = command(__doc__, requests=256).parse_args()
+    parser = command(__doc__, requests=256)
+    parser.add_argument("--package", type=Path, help="of `pnpnet export set.pt2 --pairs 50 --batch 1`")
+    options = parser.parse_args()
     p = SyntheticProblems(n=50, batch_size=options.requests, outliers=OutlierMix(max_ratio=0.4)).batch(0)
     problems, solver = list(zip(*p[:3], strict=True)), create_solver("pnpnet-set")
+    torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
-    for threads in dict.fromkeys((torch.get_num_threads(), 1)):
-        torch.set_num_threads(threads)
-        for clients in (1, 4, 16):
-            for name, solve in (("solver", solver), ("Server", Server(solver))):
-                rows.append({"threads": threads, "clients": clients, "solve": name})
-                rows[-1] |= latencies(solve, problems, clients)
-                print(rows[-1], flush=True)
+    ways: dict[str, Solve] = {"solver": solver, "Server": Server(solver)}
+    if options.package:
+        ways["package"] = Packaged(options.package)
+    for clients, (name, solve) in itertools.product((1, 4, 16), ways.items()):
+        rows.append({"clients": clients, "solve": name, **latencies(solve, problems, clients)})
+        print(rows[-1], flush=True)
     write(options.out / "serve.json", requests=options.requests, rows=rows)
 
 

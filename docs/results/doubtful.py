@@ -5,9 +5,10 @@
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from kornia.geometry.linalg import transform_points
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -22,13 +23,27 @@ EDGE = 0.1
 
 
 class Kind(NamedTuple):
-    """Problems of one kind: points, pixels, the true pose (``None``: no pose is right), and the noise that is given."""
+    """Problems of one kind: points, pixels, the true pose (``None``: no pose is right), what else a solver is given."""
 
     name: str
     world_points: Tensor
     img_points: Tensor
     truth: Pose | None
-    given: dict[str, float]
+    given: dict[str, Any]
+    intrinsics: Tensor = INTRINSICS
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """The arguments of a solver."""
+        pairs = {"world_points": self.world_points, "img_points": self.img_points}
+        return {**pairs, "intrinsics": self.intrinsics, **self.given}
+
+    @property
+    def distance(self) -> Tensor:
+        """Median depth of the points of each problem under the true pose, (B,)."""
+        assert self.truth is not None
+        depth = transform_points(self.truth.matrix, self.world_points)[..., 2]
+        return depth.where(self.given.get("mask", depth.isfinite()), torch.nan).nanmedian(1).values
 
 
 def doubtful(count: int, seed: int) -> Iterator[Kind]:

@@ -2,15 +2,14 @@
 
 import re
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import pandas as pd
 import torch
 from figures import find_rows
 from measure import ANY, HERE
-from rates import read_summary
 
+from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.metrics import SuccessRate, success_rate
 
 #: Files of ``benchmarks/real_matches.py measure``: scenes that no solver had seen, and scenes that we had looked at, on
@@ -121,7 +120,7 @@ def page_facts(
         "totals": dict(sorted(found.items(), key=lambda item: -item[1]["all"].success.rate)),
         "peer": best_peer(found),
         "files": [facts(name, at_size(one), kinds) for name, one in ((UNSEEN, unseen), (SEEN, seen))],
-        "scenes": {row["scene"]: row for row in read_summary(HERE / "real_matches_scenes.csv")},
+        "scenes": {row["scene"]: row for row in read_csv(HERE / "real_matches_scenes.csv", ()).values()},
         "reliability": first["reliability"][ANY],
         "keypoints": keypoints,
         "ways": [{row["way"]: row for row in one["rows"]} for one in keypoints["results"]],
@@ -132,7 +131,7 @@ def page_facts(
 def facts(name: str, results: Mapping[str, Any], kinds: list[str]) -> dict[str, Any]:
     """Facts of one file of ``measure``: its best PoseLib, and its rows by kind and solver."""
     found = totals(results)
-    shares = ["all", *(f"{100 * a:.0f}–{100 * b:.0f} %" for a, b in pairwise(results["settings"]["shares"]))]
+    shares = ["all", *dict.fromkeys(row["group"] for row in results["rows"] if row["group"].endswith(" %"))]
     tables = {kind: find_rows(results, kind) for kind in kinds}
     more = {"groups": shares, "tables": tables, "total": found[ANY]["all"].success.total}
     return {"name": name, "results": results, "totals": found, "peer": best_peer(found), **more}

@@ -1,10 +1,8 @@
 """Success rates of results files and of short training runs (ablations, the sweep, the size of the set network)."""
 
-import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
-from pathlib import Path
 from typing import Any
 
 from figures import grouped, mix_in_words
@@ -81,12 +79,6 @@ EXPERIMENTS = HERE.parents[1] / "conf" / "experiment"
 KERNEL = "model.solver.refine.kernel"  # column of a summary
 
 Row = Mapping[str, str]
-
-
-def read_summary(path: Path) -> list[Row]:
-    """The rows of the summary of a multirun."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def percent(row: Row, data: str) -> tuple[float, float, float]:

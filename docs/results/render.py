@@ -2,22 +2,26 @@
 
 import json
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import rates
 from figures import grouped, paper_figures, plot_real_matches, plot_reliability, plot_sweep
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matches import SEEN, UNSEEN, at_size, overview, page_facts, title
 from measure import ANY, CHI_SQUARE_95, HERE, OURS, PAPER, PEERS, RESULTS, ROBUST
 from problem_picture import plot_problem
 
 from kornia_pnpnet import PnPNet
+from kornia_pnpnet.core.files import read_csv
 from kornia_pnpnet.evaluation.plots import plot_training
 from kornia_pnpnet.evaluation.results import format_table, load_results
 from kornia_pnpnet.metrics import SuccessRate
 from kornia_pnpnet.pretrained import WEIGHTS_FOLDER, shipped_weights
+
+sys.path.append(str(HERE.parents[1] / "benchmarks"))
+import harness
 
 REPOSITORY = HERE.parents[1]
 #: Files of short runs, see ``make.py``.
@@ -33,13 +37,6 @@ TIMED_SETS = ("n = 9, no outliers", "n = 9, 3 outliers")
 ACCURACY_SET = "n = 200, 80 outliers, exact points"
 
 
-def written(template: str, **facts: Any) -> str:
-    """A page of this folder from its template."""
-    options: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
-    environment = Environment(loader=FileSystemLoader(HERE), undefined=StrictUndefined, autoescape=False, **options)
-    return environment.get_template(template).render(**facts)
-
-
 def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
     """Rows of the most used solvers on synthetic problems, by solver: the default solver, then by success."""
     sets = (*SUMMARY_SETS, ACCURACY_SET)
@@ -51,14 +48,14 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, An
 def page(overview: str) -> str:
     """The results page as Markdown, with an overview of real matches."""
     results = {name: load_results(HERE / f"{name}.json") for name in RESULTS}
-    complexity, runs = load("complexity"), {name: rates.read_summary(HERE / f"{name}.csv") for name in SUMMARIES}
+    complexity, runs = load("complexity"), {name: [*read_csv(HERE / f"{name}.csv", ()).values()] for name in SUMMARIES}
     benchmark, cameras = (load(name, REPOSITORY / "benchmarks") for name in ("solvers", "cameras"))
     rigs = grouped(cameras["rigs"], "solver")
     timed = grouped((row for row in benchmark["rows"] if row["set"] in TIMED_SETS), "solver")
     at_nine = complexity["n"].index(9)
     any_network: Any = PnPNet.from_pretrained(ANY).init
     files = {name: rates.Rates(entry) for name, entry in results.items()}
-    return written(
+    return harness.render(
         "README.md.jinja",
         ours=OURS,
         paper=PAPER,
@@ -115,13 +112,13 @@ def pages() -> dict[Path, str]:
     """The pages and the texts that their files hold."""
     matches = load(UNSEEN), load(SEEN)
     facts = overview(*matches)
-    found = {HERE / "README.md": page(written("overview.md.jinja", link="real_matches.md", **facts))}
-    found[HERE / "real_matches.md"] = written(
+    found = {HERE / "README.md": page(harness.render("overview.md.jinja", link="real_matches.md", **facts))}
+    found[HERE / "real_matches.md"] = harness.render(
         "real_matches.md.jinja", **page_facts(*matches, load("real_matches_cost"), load("keypoints"))
     )
     for path in OVERVIEW_PAGES:
         link = Path(os.path.relpath(HERE / "real_matches.md", path.parent)).as_posix()
-        block = written("overview.md.jinja", link=link, **facts)
+        block = harness.render("overview.md.jinja", link=link, **facts)
         found[path] = with_block(path.read_text(encoding="utf-8"), block)
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
@@ -23,7 +24,7 @@ __all__ = ["SUFFIXES", "ShardReport", "solve_shards"]
 #: Formats of shards.
 SUFFIXES = (".npz", ".parquet")
 
-# Key in the metadata of a results file. The value has the solver's name, and a digest (see `name` in `solve_shards`).
+# Key in the metadata of a results file. The value has the solver's name, and digests (see `name` in `solve_shards`).
 _SOLVER = b"kornia_pnpnet.solver"
 # Largest number of values that are read from a Parquet file at once: 256 MiB in float64.
 _NUMBERS_AT_ONCE = 2**25
@@ -62,38 +63,46 @@ def solve_shards(
         solve: the solver.
         sources: shards, or folders of shards. The report names the shards that cannot be read or solved.
         out: folder of the results. None of the shards may be in this folder.
-        name: name of the solver. Results files store this name and a digest of weights, options and intrinsics.
+        name: name of the solver. Results files store this name, a digest of weights, options and intrinsics, and a
+            digest of the shard, which is read once more for it.
         batch: largest number of problems that are solved at once. Parquet shards are also read in such parts.
         overwrite: also solve the shards that have results.
 
     Raises:
         InputError: when there is no shard, when two shards would have results of the same name, when ``out`` is the
-            folder of a shard, or when a shard has results of another solver or other weights, options or intrinsics.
+            folder of a shard, or when a shard has results that were made from other content, or with another solver or
+            other weights, options or intrinsics.
         OSError: when the results cannot be written.
     """
     state = chain.from_iterable(sorted(solve.solver.state_dict().items()))
     parameters = digest(repr(solve.solver), *state, solve.intrinsics)  # the text of a solver shows its options
-    mark = json.dumps({"name": name, "parameters": parameters}).encode()
-    waiting, kept = {}, 0
+    made_by = {"name": name, "parameters": parameters}
+    waiting, unread, kept = {}, list[str](), 0
     for stem, shard in _find(sources, Path(out)).items():
         target = Path(out) / f"{stem}.parquet"
         if overwrite or not target.exists():
             waiting[target] = shard
-        elif _solver_of(target) == mark:
-            kept += 1
-        else:
-            raise InputError(target, f"no results of {name} with these options: use another folder or --overwrite")
+            continue
+        try:
+            same = _solver_of(target) == _mark(made_by, shard)
+        except InputError as error:
+            unread.append(str(error))
+            continue
+        if not same:
+            message = f"no results of {name} with these options for {shard}: use another folder or --overwrite"
+            raise InputError(target, message)
+        kept += 1
     for target in waiting:  # after an interruption, the same command without --overwrite must not keep old results
         target.unlink(missing_ok=True)
     counts, failed = np.zeros(2, int), []
     with _bar(waiting.values()) as bar:
         for target, shard in waiting.items():
             try:
-                counts += _solve_shard(solve, shard, target, mark, batch, bar)
+                counts += _solve_shard(solve, shard, target, _mark(made_by, shard), batch, bar)
             except InputError as error:
                 failed.append(str(error))
     solved, problems = counts.tolist()
-    return ShardReport(solved, problems, len(waiting) - len(failed), kept, failed)
+    return ShardReport(solved, problems, len(waiting) - len(failed), kept, unread + failed)
 
 
 def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
@@ -114,6 +123,15 @@ def _find(sources: Sequence[str | Path], out: Path) -> dict[str, Path]:
             if shards.setdefault(shard.stem, shard) != shard:
                 raise InputError(shard, f"its results would have the name of the results of {shards[shard.stem]}")
     return shards
+
+
+def _mark(made_by: dict[str, str], shard: Path) -> bytes:
+    """Return the metadata entry ``_SOLVER`` of the results of a shard."""
+    try:
+        with shard.open("rb") as file:
+            return json.dumps({**made_by, "shard": hashlib.file_digest(file, "sha256").hexdigest()}).encode()
+    except OSError as error:
+        raise InputError(shard, str(error)) from None
 
 
 def _solver_of(target: Path) -> bytes | None:

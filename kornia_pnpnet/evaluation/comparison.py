@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from kornia.core.exceptions import ShapeError
+from kornia.core.exceptions import ShapeError, ValueCheckError
 from torch import nn
 
 from kornia_pnpnet.core.environment import environment
@@ -97,7 +97,7 @@ def evaluate(
         Plain data: ``format``, ``code`` (digest of the package), ``environment`` (see
         :func:`~kornia_pnpnet.core.environment.environment`), ``solvers`` (class, configuration, digest of the weights),
         ``data`` (description, limits, digest), ``rows``, and ``left_out`` (``data``, ``solver`` and ``reason`` for each
-        set whose shape a solver refuses).
+        set that a solver refuses).
 
         The row of a set and a solver has ``success`` (rate, low, high, total), ``rotation_error_deg`` and
         ``translation_error`` (quartiles), ``ok`` (share), ``us_per_problem`` (median of the timed calls; for a peer the
@@ -141,7 +141,7 @@ def evaluate(
         row: dict[str, Any] = dict(zip(("data", "solver"), names, strict=True))
         try:
             row |= _measure(solvers[row["solver"]], data[row["data"]], chunk, repeats)
-        except ShapeError as error:
+        except (ShapeError, ValueCheckError) as error:
             results["left_out"].append({**row, "reason": str(error).splitlines()[0]})
         except Exception as error:
             error.add_note(f"{row['solver']} on {row['data']}")
