@@ -77,7 +77,7 @@ def checked_inputs(
     if (dist is not None or fisheye is not None) and is_rig:
         raise ValueCheckError("dist and fisheye are for pixels of one camera: for a rig, convert pixels to bearings.")
     if weights is not None and weights.shape == (*pairs, 2):
-        got = f"one weight for each pair, not for each of u and v: got {tuple(weights.shape)}"
+        got = f"one weight for each pair, not for each of u and v (see img_cov): got {tuple(weights.shape)}"
         raise ShapeError(f"weights must have the shape {tuple(pairs)}, {got}.")
     matrices = camera_matrices(intrinsics, size)
     of_pair = is_rig and matrices.ndim == len(size) + 3
@@ -104,7 +104,7 @@ def checked_inputs(
             shapes[name] = lens, (*(size if lens.ndim > 1 else ()), lens.shape[-1])
     check_shapes(shapes, world_points)
     if pairs[-1] < MIN_PAIRS:
-        raise ShapeError(f"A pose needs at least 3 pairs, got N = {pairs[-1]}.")
+        raise ShapeError(f"A pose needs at least 3 pairs (..., N, 3), got world_points of {tuple(world_points.shape)}.")
     if mask is not None and mask.dtype != torch.bool:
         raise TypeCheckError(f"mask must be bool, got {mask.dtype}.")
     sigmas = {name: x for name, x in (("img_sigma", img_sigma), ("world_sigma", world_sigma)) if isinstance(x, Tensor)}

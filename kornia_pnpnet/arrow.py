@@ -101,7 +101,7 @@ class Solve:
         if double := {name for name in table.column_names if table.column_names.count(name) > 1}:
             raise ValueCheckError(f"the table has several columns {', '.join(sorted(double))}")
         if refused := REFUSED & {*table.column_names}:
-            raise ValueCheckError(f"the column {min(refused)} is not read; pairs with 0 in weights are ignored")
+            raise ValueCheckError(f"the column {min(refused)} is not read: call the solver itself, or drop the column")
         for name in INPUTS[: 3 if self.intrinsics is None else 2]:
             if name not in table.column_names:
                 raise ValueCheckError(f"the table has no column {name}")
@@ -189,5 +189,5 @@ def _groups(counts: np.ndarray, fits: np.ndarray, most: int, *, pads: bool) -> I
     widths = np.where((counts < _PADDED_FROM) | (not pads), counts, -(-counts // step) * step)
     for width in np.unique(widths[fits]):
         rows = np.flatnonzero(fits & (widths == width))
-        for part in np.array_split(rows, -(-len(rows) * width // most)):
+        for part in np.array_split(rows, min(len(rows), -(-len(rows) * width // most))):
             yield part, int(width)

@@ -17,7 +17,7 @@ from kornia_pnpnet.core.checks import check_positive
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.frame import Normalize
 from kornia_pnpnet.problem import MIN_PAIRS, Noise, State
-from kornia_pnpnet.refine.residual import information, normal_equations, pixel_variance, project
+from kornia_pnpnet.refine.residual import information, normal_equations, pixel_covariance, project
 from kornia_pnpnet.refine.terms import CameraTerm, PoseTerm, add_term
 from kornia_pnpnet.result import Pose, PosePrior, sound_pose
 
@@ -29,6 +29,8 @@ _LEAST_EIGENVALUE = 1e-13
 # The given focal length may differ by at most this factor from the focal length that fits the pixels at the pose. A
 # larger factor shows that the caller passed the intrinsics of the solver's call instead of the estimated intrinsics.
 _FOCAL_RATIO = 1.5
+# Iterations for the noise of the pixels beside known noise of the points.
+_ROUNDS = 10
 # `shown_noise` tries these shares of pixel noise in the mean variance of a pixel. The points' noise causes the rest.
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 
@@ -193,7 +195,6 @@ def shown_noise(
 
     See :func:`pose_covariance` for the arguments. ``more`` has ``dist``, ``fisheye``, ``cam_from_rig``, and the known
     ``world_sigma`` or ``world_cov``. The returned dict has ``img_sigma`` and, if unknown, ``world_sigma``, shape (B,).
-    Of ``world_cov`` only the mean of the variances counts.
     """
     if not {"world_sigma", "world_cov"}.isdisjoint(more):
         more["img_sigma"] = 0.0
@@ -206,13 +207,19 @@ def shown_noise(
     unit = frame.units(problem.focal, inputs.lens_scale).expand_as(weights)
     # Variance of each pixel if only the caller's pixels have noise, of the standard deviation 1, or only the points, of
     # the standard deviation 1 or the known noise.
-    noise = problem.noise or Noise(exact, torch.ones_like(exact))
-    of_pixels, of_points = unit.square(), torch.where(weights > 0, pixel_variance(projection, noise), 0.0)
+    moved = pixel_covariance(projection, problem, problem.noise or Noise(exact, torch.ones_like(exact)))
+    of_pixels, of_points = unit.square(), torch.where(weights > 0, 0.5 * (moved.uu + moved.vv), 0.0)
     by_pixel, mean = ((weights * x).sum(1) / total for x in (of_pixels, of_points))
     freedom = (2.0 * total - 6.0).clamp(min=1.0)
-    if problem.noise is not None:
-        rest = (weights * projection.sq_residual).sum(1) / freedom - mean
-        return {"img_sigma": restore_leading(size, (rest.clamp(min=0.0) / by_pixel).sqrt().to(dtype))}
+    if problem.noise is not None:  # Fisher scoring towards the likeliest variance
+        observed = projection.sq_residual * (total / freedom)[:, None]
+        variance = (weights * observed).sum(1) / (total * by_pixel)
+        least = 1e-6 * variance
+        for _ in range(_ROUNDS):
+            change = weights * of_pixels / (of_points + variance[:, None] * of_pixels).square().clamp(min=1e-200)
+            variance = (change * (observed - of_points)).sum(1) / (change * of_pixels).sum(1)
+            variance = variance.maximum(least)
+        return {"img_sigma": restore_leading(size, variance.sqrt().to(dtype))}
     share = mean.new_tensor(_SHARES)[:, None]  # (S, 1)
     variance = share[..., None] * of_pixels / by_pixel[:, None]  # (S, B, N)
     variance = variance + (1.0 - share[..., None]) * of_points / mean[:, None]

@@ -39,7 +39,7 @@ class Diagnosis(NamedTuple):
     """The result of :func:`diagnose`. The ``str`` of the result is one sentence."""
 
     trials: tuple[Trial, ...]  #: All trials. The first trial is the input as given.
-    #: The ``ok`` trials of about the largest evidence. If any of them keep the pairs unchanged, only the first one.
+    #: The ``ok`` trials with nearly the largest evidence. If some of them keep the pairs unchanged, only the first one.
     best: tuple[Trial, ...]
 
     def __str__(self) -> str:

@@ -61,15 +61,15 @@ def monte_carlo_pose_loss(
     training, when no pose fits the correspondences. The density of a pose :math:`y` is
     :math:`p(y) = \exp(-c(y))\,p_0(y) / Z`. The cost :math:`c` is half the weighted sum of the pairs' robust losses.
     Residuals are in standard deviations. If world points have noise, the cost includes the logarithm of each pixel's
-    variance. In the prior :math:`p_0`, rotations are uniform, and translations have a t distribution around the true
-    translation. The scale of this t distribution is half the distance between camera and points. Importance sampling
-    estimates the constant :math:`Z`.
+    variance. In the prior :math:`p_0`, rotations are uniform, and the centroid of the points, in the camera's axes, has
+    a t distribution around its true place. The scale of this t distribution is half the distance between camera and
+    points. Importance sampling estimates the constant :math:`Z`.
 
     The same number of samples is drawn from each component of a mixture. The components are the prior and several t
     distributions: one around the true pose, one around each hypothesis, and one around each of ``rounds`` modes. A mode
     is found by refining the sample with the largest importance weight so far. The precision of a t distribution is the
     matrix of the normal equations at its centre. Gradients flow to all inputs except poses. A problem that a solver
-    would refuse, or without the noise of a pixel, has the loss 0 and no gradient.
+    would refuse, or with an unknown (NaN) sigma, has the loss 0 and no gradient.
 
     Source: H. Chen et al., "EPro-PnP: Generalized End-to-End Probabilistic Perspective-n-Points", CVPR 2022, equations
     4 to 7. This function adds hypotheses and a prior, and uses modes in place of fitted proposals.
@@ -89,13 +89,14 @@ def monte_carlo_pose_loss(
         samples: number of poses drawn per problem, rounded down to a multiple of the number of components.
         rounds: number of t distributions around modes.
         kernel: name of the robust kernel, a key of :data:`~kornia_pnpnet.refine.kernels.KERNELS`.
-        scale: scale of the kernel in standard deviations; for the kernel ``"power"``, the exponent.
+        scale: scale of the kernel in standard deviations; for the kernel ``"power"``, the exponent. ``KERNELS`` has
+            its range.
 
     Returns:
         The loss of each problem in nats, shape :math:`(B,)`. The density is per radian³ and world unit³.
 
     Raises:
-        BaseError: see ``PnPNet.forward``; also for an unknown kernel, a scale that is not positive, fewer samples than
+        BaseError: see ``PnPNet.forward``; also for an unknown kernel, a scale out of range, fewer samples than
             components, or missing noise of the pixels.
 
     Example:
@@ -145,7 +146,8 @@ def monte_carlo_pose_loss(
     with torch.no_grad():  # a gradient of the frame would only add noise to the integral's gradient
         _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
         started = [frame.start(map_tensors(lambda y: y.to(frame.size), x.init)) for _, x in checked]
-        live = torch.stack([known, started[0][0].translation.any(-1), *(usable for _, usable in started)]).all(0)
+        (first, usable), *_ = started
+        live = known & first.translation.any(-1) & usable
     unit = frame.size[:, None]
     world_noise = None if noise.world_cov is None else noise.world_cov.divided(unit)
     noise = noise._replace(img=img, world=world / unit, world_cov=world_noise)
@@ -157,7 +159,11 @@ def monte_carlo_pose_loss(
     problem = problem._replace(noise=noise)
 
     axis = points.new_tensor([0.0, 0.0, 1.0])  # a refused problem gets a constant translation
-    poses = [Pose(pose.rotation, torch.where(live[:, None], pose.translation, axis)) for pose, _ in started]
+    poses = []
+    for pose, ok in started:  # the truth replaces hypotheses that are no poses
+        rotation = torch.where(ok[:, None, None], pose.rotation, first.rotation)
+        translation = torch.where(ok[:, None], pose.translation, first.translation)
+        poses.append(Pose(rotation, torch.where(live[:, None], translation, axis)))
     with points.device:
         refine = RobustWeightedLM(
             _MODE_ITERATIONS,

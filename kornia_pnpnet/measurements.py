@@ -114,7 +114,8 @@ def depth_points(
     of :math:`r` with respect to the pixel, and :math:`\Sigma` is the covariance of the pixel.
 
     Args:
-        img_points: pixels of the camera that measured the depth, shape :math:`(B, N, 2)`, with any leading dimensions.
+        img_points: undistorted pixels of the camera that measured the depth, shape :math:`(B, N, 2)`, with any leading
+            dimensions.
         depth: depth along the camera's z axis in the unit of the world, shape :math:`(B, N)`.
         intrinsics: see :meth:`PnPNet.forward <kornia_pnpnet.solver.PnPNet.forward>`.
         pose: world-to-camera pose of this camera, rotation :math:`(B, 3, 3)` and translation :math:`(B, 3)`. The

@@ -153,7 +153,7 @@ class Pose(NamedTuple):
         if matrices.ndim > 2:
             of_cameras = (batch,) if isinstance(intrinsics, PinholeCamera) else leading
             check_shapes({"intrinsics": (matrices, (*of_cameras, 3, 3))})
-        matrices = matrices.reshape(-1, 3, 3).expand(batch, 3, 3)
+        matrices = (matrices / matrices[..., 2:, 2:]).reshape(-1, 3, 3).expand(batch, 3, 3)
         size = [self.translation.new_full((batch,), x) for x in (height, width)]
         if isinstance(intrinsics, PinholeCamera):
             size = [x.expand(batch) for x in (intrinsics.height, intrinsics.width)]

@@ -94,9 +94,9 @@ class PnPNet(PretrainedMixin):
             explains too few pairs or is determined poorly (see :func:`~kornia_pnpnet.propose.ransac.search_on`). The
             initialiser must estimate the noise, as :class:`~kornia_pnpnet.propose.set.SetInit` does. ``"fixed"``: every
             problem gets the same work. ``None``: in evaluation mode, the effort is adaptive if the initialiser
-            estimates the noise and the refinement has iterations. Unless the effort is ``"fixed"``, the data affect two
-            more steps. In evaluation mode, poses are compared with other poses (see
-            :func:`~kornia_pnpnet.propose.alternatives.reconsider`). For rigs and bearings, RANSAC chooses the number of
+            estimates the noise and the refinement has iterations. Unless the effort is ``"fixed"``, the work varies in
+            two more steps: in evaluation mode, poses are compared with rival poses (see
+            :func:`~kornia_pnpnet.propose.alternatives.reconsider`); for rigs and bearings, RANSAC chooses the number of
             its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in
             ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If no problem of the

@@ -59,7 +59,7 @@ def rate(result: Any, problems: Problems, **limits: float) -> float:
 def reprojection_errors(problems: Problems, pose: Pose | None = None) -> Tensor:
     """Pixels of the points under poses, or under the true ones, minus those of the problems, (B, N, 2)."""
     pose = problems.pose if pose is None else pose
-    seen = (problems.world_points @ pose.rotation.mT + pose.translation[:, None]) @ problems.intrinsics.mT
+    seen = (problems.pair_intrinsics @ problems._replace(pose=pose).true_cam_points[..., None])[..., 0]
     return seen[..., :2] / seen[..., 2:] - problems.img_points
 
 

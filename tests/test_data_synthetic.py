@@ -224,8 +224,7 @@ def test_the_number_of_outliers_is_uniform_or_exact():
 
 
 def test_the_largest_number_of_outliers():
-    for n in range(3, 16):
-        assert OutlierMix(max_ratio=0.33).max_count(n) == OutlierMix().max_count(n) == n // 3
+    assert all(OutlierMix(max_ratio=0.33).max_count(n) == OutlierMix().max_count(n) == n // 3 for n in range(3, 16))
     assert [OutlierMix().max_count(n) for n in (20, 21, 50, 51)] == [6, 7, 16, 17]
     assert [OutlierMix(max_ratio=0.6, min_inliers=4).max_count(n) for n in (3, 6, 20)] == [0, 2, 12]
 

@@ -71,7 +71,7 @@ def exported(kind, solver, folder, n, **options):
 
 PROGRAMS = "pnpnet-n9", "epnp-lm", "reppnp-lm", "identity-lm", "pnpnet-set"
 #: Kind, solver, number of pairs and size of the batch of the export; then those of problems, and whether it is a rig.
-EXPORTS = [
+SLOW = [
     *(("program", name, 9, None, ((9, 2), (9, 50)), False) for name in PROGRAMS),
     ("program", "pnpnet-set", None, None, [*product((4, 5, 9, 17, 18, 30, 40, 200), (2, 50))], False),
     ("onnx", "pnpnet-n9", None, None, ((9, 1), (9, 3), (9, 100)), False),
@@ -85,16 +85,12 @@ EXPORTS = [
     ("package", "identity-lm", (12, 8), 2, [(n, 2) for n in (4, 5, 8, 9, 12)], False),
     ("package", "epnp", (12, 8), 2, [(n, 2) for n in (4, 5, 8, 9, 12)], True),
 ]
+EXPORTS = [("onnx", "identity-lm", 9, batch, ((9, 4),), False) for batch in (4, None)]
+EXPORTS += [("program", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True)]
+EXPORTS += [pytest.param(*export, marks=pytest.mark.slow) for export in SLOW]
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "n", "batch", "sizes", "is_rig"),
-    [
-        *(("onnx", "identity-lm", 9, batch, ((9, 4),), False) for batch in (4, None)),
-        ("program", "set-lm", None, None, ((5, 3), (12, 1), (12, 50), (70, 10)), True),
-        *(pytest.param(*export, marks=pytest.mark.slow) for export in EXPORTS),
-    ],
-)
+@pytest.mark.parametrize(("kind", "name", "n", "batch", "sizes", "is_rig"), EXPORTS)
 def test_exports(kind, name, n, batch, sizes, is_rig, make_problems, tmp_path):
     solver = PnPNet(SetInit(), RobustWeightedLM(2, kernel="huber")) if name == "set-lm" else create_solver(name)
     solver = PnPNet(None, RobustWeightedLM(1)) if name == "identity-lm" else solver

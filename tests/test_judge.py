@@ -18,6 +18,7 @@ from kornia_pnpnet.refine.residual import project, rotation_angle
 from kornia_pnpnet.refine.terms import CameraTerm
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
+NAMES = ["pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac"]
 
 
 def drawn(pairs, outliers, sigma):
@@ -202,9 +203,6 @@ def test_noise_whose_covariance_has_no_float32_determinant_harms_its_problem_onl
     found = solver(*p[:3], **noise)
     assert found.ok.tolist() == [True, False, True]
     assert torch.equal(found.matrix[::2], expected.matrix[::2])
-
-
-NAMES = ["pnpnet-set", "epnp-lm", "reppnp-lm", "p3p-ransac"]
 
 
 def boards(generator, batch=60, tilt=40.0, sigma=0.0, dtype=torch.float64):

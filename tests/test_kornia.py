@@ -132,11 +132,11 @@ def test_poses_as_elements_of_kornias_group(make_problems):
 
 def test_cameras_at_a_pose_project_as_we_do(make_problems):
     p = make_problems(n=9, batch=5, noise=False)
-    for intrinsics in (p.intrinsics, cameras(p.intrinsics)):
+    for intrinsics in (p.intrinsics, 2.0 * p.intrinsics, cameras(p.intrinsics)):
         camera = p.pose.camera(intrinsics, height=480, width=640)
         seen = camera.project(p.world_points[:, :1])[:, 0]
         torch.testing.assert_close(seen, p.img_points[:, 0], rtol=1e-9, atol=1e-6)
-        assert camera.extrinsics.equal(p.pose.matrix)
+        assert (camera.extrinsics.equal(p.pose.matrix), camera.camera_matrix.equal(p.intrinsics)) == (True, True)
     assert camera.height.tolist() == [7.0] * 5  # that of the camera that came
     shared = p.pose.camera(p.intrinsics[0].float(), height=480, width=640)
     assert (shared.intrinsics.dtype, shared.intrinsics.shape) == (torch.float64, (5, 4, 4))

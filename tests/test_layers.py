@@ -93,13 +93,13 @@ def test_optional_packages_have_one_door(package, owners):
     assert not {user for user in users if not any(f"{user}.".startswith(f"{owner}.") for owner in owners)}
 
 
-def test_importing_the_package_imports_no_extras_and_leaves_no_trace():
+def test_importing_the_package_imports_no_extras_and_loading_a_solver_leaves_no_trace():
     code = (
-        "import sys, torch; torch.manual_seed(5); before = (torch.get_rng_state(), torch.get_num_threads());"
-        "import kornia_pnpnet; after = (torch.get_rng_state(), torch.get_num_threads());"
-        "assert torch.equal(before[0], after[0]) and before[1] == after[1];"
-        "assert torch.get_default_dtype() == torch.float32;"
-        f"print([name for name in {EXTRAS!r} if name in sys.modules])"
+        "import sys, torch; torch.manual_seed(5); old = (torch.get_rng_state(), torch.get_num_threads());"
+        f"import kornia_pnpnet; print([name for name in {EXTRAS!r} if name in sys.modules]);"
+        "kornia_pnpnet.create_solver('pnpnet-set');"
+        "new = (torch.get_rng_state(), torch.get_num_threads());"
+        "assert torch.equal(old[0], new[0]) and (old[1], torch.get_default_dtype()) == (new[1], torch.float32)"
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert output.stdout.strip() == "[]"

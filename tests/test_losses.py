@@ -236,11 +236,11 @@ def test_hypotheses_find_other_modes():
     arguments = (world, p.img_points, p.intrinsics)
     options = {"img_sigma": 2.0, "kernel": "truncated", "scale": 4.0, "samples": 600, "rounds": 0}
     torch.manual_seed(0)
-    one, two = (monte_carlo_pose_loss(p.pose, x, *arguments, **options) for x in ([], other))
-    first, second = (
-        pose_covariance(pose, *arguments, img_sigma=2.0, weights=share.expand(4, 40)).logdet()
-        for pose, share in ((p.pose, even), (other, 1.0 - even))
-    )
+    none = Pose(rotation, torch.nan * other.translation)
+    one, two, spoilt = (monte_carlo_pose_loss(p.pose, x, *arguments, **options) for x in ([], other, none))
+    assert (spoilt != 0).all()
+    sides = (p.pose, even), (other, 1.0 - even)
+    first, second = (pose_covariance(x, *arguments, img_sigma=2.0, weights=y.expand(4, 40)).logdet() for x, y in sides)
     torch.testing.assert_close(two - one, torch.log1p((0.5 * (second - first)).exp()), rtol=0.0, atol=0.2)
 
 

@@ -22,6 +22,14 @@ from kornia_pnpnet.data import OutlierMix, SlabPoints, SyntheticProblems
 from kornia_pnpnet.losses import pose_distances
 from kornia_pnpnet.propose.epnp import EPnP
 
+STARTED = "p3p-ransac", "ransac-epnp-lm", "epnp", "reppnp", "epnp-lm", "pnpnet-set", "pnpnet-n9"
+NAMES = "identity-lm", "p3p-ransac", "pnpnet-n9", "poselib"
+WRONG = [("pnpnet-nine", {}, r"pnpnet-nine.*identity-lm"), (["epnp"], {}, "epnp"), (None, {}, "None")]
+WRONG += [("pnpnet-n9", {"m": -1}, "m must")]
+WRONG += [(name, {"iterations": 3}, r"options: got .* 'iterations'\.$") for name in NAMES]
+CONFIGS = {"six": {"init": {"name": "MLPInit", "n": "six"}}, "Oracle": {"init": {"name": "Oracle"}}}
+CONFIGS |= {"refine": {"refine": None}, "tukey": {"refine": {"kernel": "tukey"}}, "colour": {"colour": "red"}}
+
 
 def hard_problems(count=30):
     options = {"points": SlabPoints(), "outliers": OutlierMix(count=180), "world_sigma": 0.01}
@@ -179,9 +187,7 @@ def test_a_training_without_a_gradient_warns_once(make_problems, generator):
         solver(p.world_points, rays, p.intrinsics)
 
 
-@pytest.mark.parametrize(
-    "name", ["p3p-ransac", "ransac-epnp-lm", "epnp", "reppnp", "epnp-lm", "pnpnet-set", "pnpnet-n9"]
-)
+@pytest.mark.parametrize("name", STARTED)
 def test_a_given_pose_helps_and_does_no_harm(name, make_problems, perturb):
     p = make_problems(noise=False)
     far = Pose(p.pose.rotation.flip(0), -3.0 * p.pose.translation)
@@ -338,14 +344,6 @@ def test_an_initialiser_of_ones_own(make_problems, tmp_path):
     with pytest.raises(ValueCheckError, match="Identity cannot be saved"):
         solver.save_pretrained(tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-NAMES = "identity-lm", "p3p-ransac", "pnpnet-n9", "poselib"
-WRONG = [("pnpnet-nine", {}, r"pnpnet-nine.*identity-lm"), (["epnp"], {}, "epnp"), (None, {}, "None")]
-WRONG += [("pnpnet-n9", {"m": -1}, "m must")]
-WRONG += [(name, {"iterations": 3}, r"options: got .* 'iterations'\.$") for name in NAMES]
-CONFIGS = {"six": {"init": {"name": "MLPInit", "n": "six"}}, "Oracle": {"init": {"name": "Oracle"}}}
-CONFIGS |= {"refine": {"refine": None}, "tukey": {"refine": {"kernel": "tukey"}}, "colour": {"colour": "red"}}
 
 
 @pytest.mark.parametrize(("name", "options", "message"), [*WRONG, *(("config", CONFIGS[x], x) for x in CONFIGS)])

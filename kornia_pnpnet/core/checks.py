@@ -61,7 +61,8 @@ def check_tensors(tensors: Mapping[str, Any]) -> None:
     """Raise ``TypeCheckError`` when a value is not a tensor. ``None`` is skipped."""
     for name, value in tensors.items():
         if value is not None and not isinstance(value, Tensor):
-            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}.")
+            hint = " (torch.from_numpy converts it)" if type(value).__name__ == "ndarray" else ""
+            raise TypeCheckError(f"{name} must be a tensor, got {type(value).__name__}{hint}.")
 
 
 def check_form(form: list[str], **tensors: Tensor) -> None:

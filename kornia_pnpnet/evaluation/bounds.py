@@ -38,7 +38,7 @@ class KnownInliers(Configured):
 
     def solve_with_truth(self, problems: Problems) -> PnPResult:
         """See :class:`~kornia_pnpnet.evaluation.SeesTruth`."""
-        return _least_squares(problems, problems.inliers.to(problems.world_points.dtype))
+        return _least_squares(problems, problems.inliers * _areas(problems))
 
 
 class KnownInliersAndNoise(Configured):
@@ -85,5 +85,14 @@ class KnownInliersAndNoise(Configured):
         trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
         img_sigma = img_sigma.maximum(LEAST_NOISE * focal.abs().amax(-1))
         variance = img_sigma.square() + world_sigma.square() * trace / 2.0
-        size = focal.prod(-1).abs()  # residuals are refined at one focal length for all cameras of a rig
-        return torch.where(problems.inliers, size / size.mean(1, keepdim=True) / variance, 0.0)
+        return torch.where(problems.inliers, _areas(problems) / variance, 0.0)
+
+
+def _areas(problems: Problems) -> Tensor:
+    """The product of both focal lengths of each pair, divided by the mean, (B, N).
+
+    Residuals are refined at one focal length for all cameras of a rig. As a weight, the product makes them pixels.
+    """
+    camera = problems.pair_intrinsics / problems.pair_intrinsics[..., 2:, 2:]
+    size = (camera[..., 0, 0] * camera[..., 1, 1]).abs()
+    return size / size.mean(1, keepdim=True)

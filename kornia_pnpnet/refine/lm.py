@@ -361,7 +361,7 @@ class RobustWeightedLM(Configured):
         return Refinement(now.state, weights, cost, ok, in_front, chance, found)
 
     def shown(self, plan: Plan, now: Progress) -> tuple[Plan, Progress]:
-        """Fit a mixture to the residuals. Set estimated noise of points to 0 if 0 makes them clearly likelier."""
+        """Fit a mixture to the residuals. Set estimated noise of points to 0 if that is clearly likelier."""
         problem, noise = plan.problem, plan.problem.noise
         if noise is None or noise.world_cov is not None:
             return plan, now._replace(mixture=plan.evidence_at(now.state).mixture)
