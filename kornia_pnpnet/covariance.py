@@ -192,6 +192,7 @@ def shown_noise(
 
     At a larger depth, the noise of a point moves the point's pixel less. The noise of a pixel does not depend on the
     depth. Five mixtures of pixel noise and point noise are tried. The largest Gaussian likelihood selects one of them.
+    Beside known noise of the points, the noise of the pixels with the largest likelihood is found by iterations.
 
     See :func:`pose_covariance` for the arguments. ``more`` has ``dist``, ``fisheye``, ``cam_from_rig``, and the known
     ``world_sigma`` or ``world_cov``. The returned dict has ``img_sigma`` and, if unknown, ``world_sigma``, shape (B,).

@@ -291,7 +291,8 @@ class PackagedSolver:
         any_number = not self.sizes or (len(self.sizes) > 1 and given <= size)
         batch, n = self.batch or batch, max(given, MIN_PAIRS if self.sizes else 4) if any_number else size
         weights = world_points.new_ones(batch, n) if weights is None else weights
-        cameras, intrinsics = (batch, n, 3, 3) if self.rig else (batch, 3, 3), camera_matrices(intrinsics)
+        cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
+        intrinsics = camera_matrices(intrinsics)
         check_tensors({"intrinsics": intrinsics})
         intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)

@@ -146,7 +146,7 @@ def monte_carlo_pose_loss(
     with torch.no_grad():  # a gradient of the frame would only add noise to the integral's gradient
         _, frame = Normalize(order=False)(*inputs[:5], noise._replace(img=img, world=world))
         started = [frame.start(map_tensors(lambda y: y.to(frame.size), x.init)) for _, x in checked]
-        (first, usable), *_ = started
+        first, usable = started[0]
         live = known & first.translation.any(-1) & usable
     unit = frame.size[:, None]
     world_noise = None if noise.world_cov is None else noise.world_cov.divided(unit)

@@ -22,6 +22,14 @@ from kornia_pnpnet.cli.shards import solve_shards  # noqa: E402
 
 NAMES = ("world_points", "img_points", "intrinsics")
 SOLVE = Solve("reppnp")
+BAD = {"a missing list": ("world_points", None, "malformed"), "an empty list": ("img_points", [], "malformed")}
+BAD |= {"too few pixels": ("img_points", [1.0] * 17, "malformed"), "no camera": ("intrinsics", [0.0] * 9, "camera")}
+COUNTS = {"two pairs": 6, "part of a point": 28, "too many points": 30}
+BAD |= {name: ("world_points", [1.0] * count, "malformed") for name, count in COUNTS.items()}
+BAD |= {"half a camera": ("intrinsics", [1.0] * 4, "malformed"), "NaN": ("img_points", [np.nan] * 18, "not_finite")}
+BAD |= {"a missing number": ("world_points", [None, *[1.0] * 26], "not_finite")}
+BAD |= {"a missing point": ("world_points", [[1.0] * 3] * 5 + [None] + [[1.0] * 3] * 4, "malformed")}
+BAD |= {"one point": ("world_points", [1.0] * 27, "degenerate")}
 
 
 @pytest.fixture
@@ -95,16 +103,6 @@ def test_other_columns_pass_through_and_rows_keep_their_order(draw):
     assert found["id"].to_pylist() == [3, 1, 4, 1, 5]
     backwards = Solve("epnp-lm")(table.take([4, 3, 2, 1, 0]))
     np.testing.assert_allclose(numbers(backwards, "rotation")[::-1], numbers(found, "rotation"), atol=1e-5)
-
-
-BAD = {"a missing list": ("world_points", None, "malformed"), "an empty list": ("img_points", [], "malformed")}
-BAD |= {"too few pixels": ("img_points", [1.0] * 17, "malformed"), "no camera": ("intrinsics", [0.0] * 9, "camera")}
-COUNTS = {"two pairs": 6, "part of a point": 28, "too many points": 30}
-BAD |= {name: ("world_points", [1.0] * count, "malformed") for name, count in COUNTS.items()}
-BAD |= {"half a camera": ("intrinsics", [1.0] * 4, "malformed"), "NaN": ("img_points", [np.nan] * 18, "not_finite")}
-BAD |= {"a missing number": ("world_points", [None, *[1.0] * 26], "not_finite")}
-BAD |= {"a missing point": ("world_points", [[1.0] * 3] * 5 + [None] + [[1.0] * 3] * 4, "malformed")}
-BAD |= {"one point": ("world_points", [1.0] * 27, "degenerate")}
 
 
 @pytest.mark.parametrize("kind", BAD)

@@ -25,6 +25,8 @@ SOLVERS = ("epnp", "p3p-ransac:max_samples=50", "opencv-epnp", "poselib")
 PEERS = ("cv2", "poselib", "pycolmap")
 NAMES = ("contenders", "gpu", "harness", "page", "performance", "process", "solvers")
 contenders, gpu, harness, page, performance, process, benchmark = (importlib.import_module(name) for name in NAMES)
+# Exporting takes minutes.
+MARKS = {x: [pytest.mark.slow] * x.endswith(("ONNX", "packaged")) for x in contenders.CONTENDERS if "compiled" not in x}
 
 
 def load(script, *packages):
@@ -102,10 +104,6 @@ def test_missing_packages_are_skipped_with_a_reason(monkeypatch):
     assert "PoseLib" in results["skipped"]["poselib"]
     assert {entry["solver"] for entry in results["rows"]} == {"epnp"}
     assert results["memory"] == []
-
-
-# Exporting takes minutes.
-MARKS = {x: [pytest.mark.slow] * x.endswith(("ONNX", "packaged")) for x in contenders.CONTENDERS if "compiled" not in x}
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks) for name, marks in MARKS.items()])

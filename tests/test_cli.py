@@ -38,6 +38,42 @@ BAD_CSV += [("X,Y,Z,u,v,img_sigma\n1,2,3,4,5,1\n", ": the column img_sigma is no
 BAD_CSV += [("X,Y,Z,u,v,weight\n1,2,3,4,5,-1\n", ":2: weight must be a number of at least 0, got '-1'")]
 BAD_CSV += [(HEADER + GOOD * 2, ": a pose needs at least 3 correspondences, got 2")]
 BAD_CSV += [(HEADER.encode() + b"\xff\xfe\n", ":2: not a text file in UTF-8")]
+BAD_CAMERAS = ("1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,0,320,240", "8,8,nan,2")
+PINHOLE = "PINHOLE,640,480,800,810,320,240"
+SOLVE, EVALUATE = f"solve pairs.csv --intrinsics {CAMERA}", "evaluate --problems 5 --out results.json"
+#: Arguments, and what the error names.
+BAD = [("", ""), ("fly", "fly"), ("solve", "FILE"), ("export x.onnx --pairs 6,9", "one number of pairs")]
+BAD += [(f"solve pairs.csv --intrinsics={camera}", "pnpnet: --intrinsics: ") for camera in BAD_CAMERAS]
+BAD += [(f"{SOLVE} --camera {PINHOLE}", "--camera stands alone"), ("solve pairs.csv pairs.csv", "--batch")]
+BAD += [("solve pairs.csv --camera PINHOLE,640,480,800", "--camera: expected MODEL")]
+BAD += [(f"solve pairs.csv --camera {PINHOLE} --solver epnp:focal=unknown", "a known focal length")]
+BAD += [(f"{SOLVE} --threshold 0", "--threshold"), (f"{SOLVE} --focal=-1", "--focal")]
+BAD += [(f"{SOLVE} --focal 1200", "--intrinsics 1200,1200,cx,cy"), (f"{SOLVE} --out x", "--out need --batch")]
+BAD += [(f"{SOLVE} --focal 0.1 --diagnose", "--diagnose needs a known focal length")]
+BAD += [(f"{SOLVE} --focal unknown --solver poselib", "does not estimate focal lengths")]
+BAD += [(f"{SOLVE} --batch {option}", "not for --batch") for option in ("--json", "--plot x.png")]
+BAD += [(f"{SOLVE} --plot x.txt", "a .pdf, .png or .svg file"), (f"{SOLVE} --plot mine.png", "--overwrite")]
+BAD += [(f"{SOLVE} --solver {name}", name) for name in ("nobody", "tests")]
+BAD += [(f"{SOLVE} --solver opencv-ransac:{option}=no", option) for option in ("speed", "refine")]
+BAD += [(f"solve {path} --intrinsics {CAMERA}", f"{path}: ") for path in ("missing.csv", "sub")]
+BAD += [(f"{EVALUATE} --{option} nowhere", "nowhere") for option in ("data", "solver")]
+BAD += [(f"{EVALUATE} --outliers none,{word}", repr(word)) for word in ("some", "", "120%", "x%")]
+BAD += [(f"{EVALUATE} --n {n}", why) for n, why in (("9,", "--n"), ("20,6 --outliers 7", "n = 6"))]
+BAD += [(f"{EVALUATE} --n 9,2", "at least 3 pairs, got 2")]
+BAD += [(f"{EVALUATE} --solver known-inliers:threshold=3", "threshold"), (f"{SOLVE} --solver known-inliers", "bound")]
+BAD += [(f"export {name}", ".pt2") for name in ("model", "model.pt", "model.so", ".onnx")]
+BAD += [("export x.onnx --solver opencv-ransac", "opencv-ransac belongs to another library")]
+BAD += [(f"export {name}", "--overwrite") for name in ("mine.onnx", "mine.pt2")]
+#: Arguments that keep each command short, and the options that are drawn.
+SHORT = {
+    "solve": (("sound.csv", "--intrinsics", "3400,3400,0,0"), "--solver --threshold --batch-size --focal --camera"),
+    "evaluate": (("--solver", "epnp", "--problems", 3), "--solver --data --n --outliers --seed --dtype --plot"),
+    "export": (("--solver", "p3p-ransac"), "--pairs"),
+    "list": ((), "--x"),
+    "demo": (("--problems", 3, "--train-seconds", 0), "--data --problems"),
+}
+SETS = ["9", "6,9", "none,2", "50%", "uniform", "float64", "gaussian_pose", "p3p-ransac", "1e9"]
+TEXTS = WORDS | st.sampled_from(SETS)
 
 
 def points(n=9):
@@ -216,34 +252,6 @@ def test_bad_npz_files(tmp_path, monkeypatch):
     np.savez_compressed(path, world_points=np.zeros((50_000, 3)), img_points=np.zeros((50_000, 2)))
     assert path.stat().st_size < 10_000
     assert "more than 0.0 GB: split the file" in refused("solve", path, "--intrinsics", CAMERA)
-
-
-BAD_CAMERAS = ("1,2,3", "1,2,3,x", "1,2,3,4,5", "0,800,320,240", "800,0,320,240", "8,8,nan,2")
-PINHOLE = "PINHOLE,640,480,800,810,320,240"
-SOLVE, EVALUATE = f"solve pairs.csv --intrinsics {CAMERA}", "evaluate --problems 5 --out results.json"
-#: Arguments, and what the error names.
-BAD = [("", ""), ("fly", "fly"), ("solve", "FILE"), ("export x.onnx --pairs 6,9", "one number of pairs")]
-BAD += [(f"solve pairs.csv --intrinsics={camera}", "pnpnet: --intrinsics: ") for camera in BAD_CAMERAS]
-BAD += [(f"{SOLVE} --camera {PINHOLE}", "--camera stands alone"), ("solve pairs.csv pairs.csv", "--batch")]
-BAD += [("solve pairs.csv --camera PINHOLE,640,480,800", "--camera: expected MODEL")]
-BAD += [(f"solve pairs.csv --camera {PINHOLE} --solver epnp:focal=unknown", "a known focal length")]
-BAD += [(f"{SOLVE} --threshold 0", "--threshold"), (f"{SOLVE} --focal=-1", "--focal")]
-BAD += [(f"{SOLVE} --focal 1200", "--intrinsics 1200,1200,cx,cy"), (f"{SOLVE} --out x", "--out need --batch")]
-BAD += [(f"{SOLVE} --focal 0.1 --diagnose", "--diagnose needs a known focal length")]
-BAD += [(f"{SOLVE} --focal unknown --solver poselib", "does not estimate focal lengths")]
-BAD += [(f"{SOLVE} --batch {option}", "not for --batch") for option in ("--json", "--plot x.png")]
-BAD += [(f"{SOLVE} --plot x.txt", "a .pdf, .png or .svg file"), (f"{SOLVE} --plot mine.png", "--overwrite")]
-BAD += [(f"{SOLVE} --solver {name}", name) for name in ("nobody", "tests")]
-BAD += [(f"{SOLVE} --solver opencv-ransac:{option}=no", option) for option in ("speed", "refine")]
-BAD += [(f"solve {path} --intrinsics {CAMERA}", f"{path}: ") for path in ("missing.csv", "sub")]
-BAD += [(f"{EVALUATE} --{option} nowhere", "nowhere") for option in ("data", "solver")]
-BAD += [(f"{EVALUATE} --outliers none,{word}", repr(word)) for word in ("some", "", "120%", "x%")]
-BAD += [(f"{EVALUATE} --n {n}", why) for n, why in (("9,", "--n"), ("20,6 --outliers 7", "n = 6"))]
-BAD += [(f"{EVALUATE} --n 9,2", "at least 3 pairs, got 2")]
-BAD += [(f"{EVALUATE} --solver known-inliers:threshold=3", "threshold"), (f"{SOLVE} --solver known-inliers", "bound")]
-BAD += [(f"export {name}", ".pt2") for name in ("model", "model.pt", "model.so", ".onnx")]
-BAD += [("export x.onnx --solver opencv-ransac", "opencv-ransac belongs to another library")]
-BAD += [(f"export {name}", "--overwrite") for name in ("mine.onnx", "mine.pt2")]
 
 
 @pytest.mark.parametrize(("arguments", "culprit"), BAD)
@@ -466,18 +474,6 @@ def test_spoiled_results_are_a_line_and_no_traceback(tmp_path, drawn):
     run()
     assert codes[0]
     assert codes[2] >= 5
-
-
-#: Arguments that keep each command short, and the options that are drawn.
-SHORT = {
-    "solve": (("sound.csv", "--intrinsics", "3400,3400,0,0"), "--solver --threshold --batch-size --focal --camera"),
-    "evaluate": (("--solver", "epnp", "--problems", 3), "--solver --data --n --outliers --seed --dtype --plot"),
-    "export": (("--solver", "p3p-ransac"), "--pairs"),
-    "list": ((), "--x"),
-    "demo": (("--problems", 3, "--train-seconds", 0), "--data --problems"),
-}
-SETS = ["9", "6,9", "none,2", "50%", "uniform", "float64", "gaussian_pose", "p3p-ransac", "1e9"]
-TEXTS = WORDS | st.sampled_from(SETS)
 
 
 def test_any_arguments_are_a_line_and_no_traceback(tmp_path, monkeypatch):

@@ -15,6 +15,9 @@ from kornia_pnpnet.core.trees import iter_tensors, map_tensors
 from kornia_pnpnet.data import CameraProblems, DepthMaps, OutlierKind, OutlierMix, SceneProblems, SyntheticProblems
 
 COUNT = 20_000
+VIEWS = [data.FacadePoints, data.RoomPoints, data.DrivePoints]
+#: Points at the depths 1, 2 and 3.
+PLANES = [data.BoxPoints(z_near=z, depth=0.0) for z in (1.0, 2.0, 3.0)]
 
 
 def draw(n=9, batch=COUNT, **options):
@@ -337,11 +340,6 @@ def test_rigs():
     assert not torch.equal(rotation[:, 0], rotation[:, 1])
     centres = -(rotation.mT @ translation[..., None])[..., 0].norm(dim=-1)
     assert (centres.amax(1) / centres.amin(1) - 1).abs().max() < 1e-9
-
-
-VIEWS = [data.FacadePoints, data.RoomPoints, data.DrivePoints]
-#: Points at the depths 1, 2 and 3.
-PLANES = [data.BoxPoints(z_near=z, depth=0.0) for z in (1.0, 2.0, 3.0)]
 
 
 def thinness(points):

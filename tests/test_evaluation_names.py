@@ -146,14 +146,14 @@ def test_the_pose_minimises_the_weighted_squares_of_the_inliers_also_of_rigs(mak
     for problems in (make_problems(batch=50, outliers=2), rigs):
         result = bound().solve_with_truth(problems)
         assert torch.equal(result.weights > 0, problems.inliers)
-        assert result.ok.double().mean() > 0.9
+        assert result.ok.all()
         turn, shift = torch.zeros(2, 50, 3, dtype=torch.float64).requires_grad_()
         pose = Pose(axis_angle_to_rotation_matrix(turn) @ result.rotation, result.translation + shift)
         weights = result.weights.detach() / problems.pair_intrinsics[..., :2, :2].det()  # unweighs cameras of a rig
         weights = problems.inliers if bound is KnownInliers else weights
         costs = (weights * reprojection_errors(problems, pose).square().sum(-1)).sum(-1)
-        slopes = torch.stack(torch.autograd.grad(costs.sum(), (turn, shift))).abs().amax((0, 2))
-        assert (slopes < 1e-6 * costs.max())[result.ok].all()
+        # A radian moves pixels by thousands, so that a gradient of this size is rounding.
+        assert torch.cat(torch.autograd.grad(costs.sum(), (turn, shift))).abs().max() < 1e-6 * costs.max()
     assert rate(result, rigs) > 0.9
 
 

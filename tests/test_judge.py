@@ -251,6 +251,7 @@ def test_a_pose_is_not_believed_beside_its_mirror_image(generator):
         result = create_solver("pnpnet-set", effort=effort)(*given)
         error = pose_errors(result.pose, pose).rotation_error_deg
         believed[effort] = result.ok[error > 10.0].double().mean(), result.ok[error < 5.0].double().mean()
+        assert (result.status[~result.ok] != 0).all()
         assert (result.probability[result.ok] >= LEAST_PROBABILITY).all()
     assert believed["fixed"][0] > 0.5
     assert believed["adaptive"][0] < 0.5

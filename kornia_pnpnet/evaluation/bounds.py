@@ -79,8 +79,7 @@ class KnownInliersAndNoise(Configured):
         cam_points = problems.true_cam_points
         depth = cam_points[..., 2:]
         depth = torch.where(depth > 0, depth, 1.0)  # the solver ignores points behind the camera
-        camera = problems.pair_intrinsics
-        focal = (camera / camera[..., 2:, 2:]).diagonal(dim1=-2, dim2=-1)[..., :2]
+        focal = _focal_lengths(problems)
         # J_x = (f / z) [1, 0, -p; 0, 1, -q] R with p = x / z and q = y / z. The rotation cancels in the trace.
         trace = ((focal / depth).square() * (1.0 + (cam_points[..., :2] / depth).square())).sum(-1)  # (B, N)
         img_sigma = img_sigma.maximum(LEAST_NOISE * focal.abs().amax(-1))
@@ -88,11 +87,16 @@ class KnownInliersAndNoise(Configured):
         return torch.where(problems.inliers, _areas(problems) / variance, 0.0)
 
 
+def _focal_lengths(problems: Problems) -> Tensor:
+    """Both focal lengths of each pair, (B, N, 2), or (B, 1, 2) without a rig."""
+    camera = problems.pair_intrinsics
+    return (camera / camera[..., 2:, 2:]).diagonal(dim1=-2, dim2=-1)[..., :2]
+
+
 def _areas(problems: Problems) -> Tensor:
-    """The product of both focal lengths of each pair, divided by the mean, (B, N).
+    """The product of both focal lengths of each pair, divided by the mean, shape as :func:`_focal_lengths`.
 
     Residuals are refined at one focal length for all cameras of a rig. As a weight, the product makes them pixels.
     """
-    camera = problems.pair_intrinsics / problems.pair_intrinsics[..., 2:, 2:]
-    size = (camera[..., 0, 0] * camera[..., 1, 1]).abs()
+    size = _focal_lengths(problems).prod(-1).abs()
     return size / size.mean(1, keepdim=True)
