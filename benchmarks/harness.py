@@ -13,8 +13,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_pnpnet.core.environment import environment
@@ -26,6 +28,8 @@ HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent / "docs"
 #: What a call does.
 FORWARD, BACKWARD = "forward", "forward+backward"
+#: Samples of clusters for an interval.
+SAMPLES = 2000
 
 Row = Mapping[str, Any]
 
@@ -52,6 +56,13 @@ def threads(count: int = 1) -> Iterator[None]:
 def seconds(call: Callable[[], object], times: int = 1, clock: Callable[[], float] = time.perf_counter) -> float:
     """Seconds of a call, the mean over ``times`` calls, without garbage collection."""
     return timeit.timeit(call, timer=clock, number=times) / times
+
+
+def interval(sums: NDArray[Any], counts: NDArray[Any]) -> list[float]:
+    """A mean and its 95 % interval, by drawing clusters with replacement, from the sum and the size of each cluster."""
+    drawn = np.random.default_rng(0).integers(len(sums), size=(SAMPLES, len(sums)))
+    means = sums[drawn].sum(1) / counts[drawn].sum(1)
+    return [float(sums.sum() / counts.sum()), *(float(x) for x in np.percentile(means, (2.5, 97.5)))]
 
 
 def in_turns(timers: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import parser, recorded
+from harness import SAMPLES, interval, parser, recorded
 from sklearn.isotonic import IsotonicRegression
 from torch import Tensor, nn
 
@@ -38,7 +38,7 @@ FEWEST = 6  # pairs that PoseLib gets at least, the most confident ones
 MEDIAN, MEAN_LOG = math.sqrt(2 * math.log(2)), 0.5 * (math.log(2) - 0.5772156649)
 # Noise is fitted on errors between these, relative to the largest of an inlier; confidences count as LEAST at least.
 FITTED, LEAST = (0.02, 3.0), 0.05
-BATCH, SAMPLES, SEED = 500, 2000, 0
+BATCH = 500
 BASES = ("weights=c**6", "weights=c**2", "nothing")  # ways that all others are compared to
 EXACT = {"world_sigma": torch.tensor(0.0)}
 
@@ -108,25 +108,21 @@ def ways(seen: Problems, inlier_px: float) -> tuple[dict[str, Way], dict[str, fl
     }, {"sigma_px": float(sigma), "power": slope, "inlier_px": inlier_px}
 
 
-def interval(difference: Tensor, cluster: Tensor) -> list[float]:
-    """Mean difference and its 95 % interval, by drawing clusters with replacement."""
-    group = cluster.unique(return_inverse=True)[1].numpy()
-    sums, counts = np.bincount(group, difference.numpy()), np.bincount(group)
-    drawn = np.random.default_rng(SEED).integers(len(sums), size=(SAMPLES, len(sums)))
-    means = sums[drawn].sum(1) / counts[drawn].sum(1)
-    return [float(difference.mean()), *(float(x) for x in np.percentile(means, (2.5, 97.5)))]
-
-
 def measure(path: Path) -> dict[str, Any]:
     """Measure all ways on the problems of a file that were not seen."""
     p, inlier_px = read(path)
     seen, new = ({name: value[at] for name, value in p.items()} for at in (p["seen"], ~p["seen"]))
     found, chosen = ways(seen, inlier_px)
     scores, rows = {name: solve(new, way) for name, way in found.items()}, []
+    cluster = new["cluster"].unique(return_inverse=True)[1].numpy()
+
+    def less(values: Tensor, others: Tensor) -> list[float]:
+        return interval(np.bincount(cluster, (values - others).numpy()), np.bincount(cluster))
+
     for name, one in scores.items():
         row = {key: float(value.mean()) for key, value in one.items()} | {"median": float(one["error"].median())}
-        less = {base: {k: interval(v - scores[base][k], new["cluster"]) for k, v in one.items()} for base in BASES}
-        rows.append({"way": name, **row, "less": less})
+        below = {base: {key: less(v, scores[base][key]) for key, v in one.items()} for base in BASES}
+        rows.append({"way": name, **row, "less": below})
     inliers = (reprojection(new) < inlier_px)[new["mask"]].double()
     counts = {"seen": len(seen["t"]), "measured": len(new["t"]), "clusters": len(new["cluster"].unique())}
     share = {"pairs": len(inliers) / len(new["t"]), "inliers": float(inliers.mean())}

@@ -320,8 +320,10 @@ def batch(matches: Matches, at: Tensor) -> tuple[tuple[Problems, Tensor, Tensor]
     return map_tensors(lambda x: x if x.dtype == torch.bool else x.float(), given), origin
 
 
-def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -> tuple[PnPResult, float]:
-    """Solve a batch; the result, and milliseconds for a problem.
+def call(
+    solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor, times: int = 1
+) -> tuple[PnPResult, float]:
+    """Solve a batch; the result, and milliseconds for a problem, the median of some ``times``.
 
     A bound sees the reference poses. Peers with a ratio get the best pairs first; only their own calls are timed.
     """
@@ -332,16 +334,17 @@ def call(solver: Any, spec: str, given: Problems, mask: Tensor, ratio: Tensor) -
         given, mask = given._replace(world_points=world, img_points=img), mask.gather(1, order)
     elif CONFIDENCE in spec:
         known = {"confidence": 1 - ratio}
-    start = time.perf_counter()
-    bound = isinstance(solver, SeesTruth)
-    result = solver.solve_with_truth(given) if bound else solver(*given[:3], mask=mask, **known)
-    seconds = solver.library_s if isinstance(solver, PeerSolver) else time.perf_counter() - start
-    return result, 1e3 * seconds / len(mask)
+    bound, seconds = isinstance(solver, SeesTruth), []
+    for _ in range(times):
+        start = time.perf_counter()
+        result = solver.solve_with_truth(given) if bound else solver(*given[:3], mask=mask, **known)
+        seconds.append(solver.library_s if isinstance(solver, PeerSolver) else time.perf_counter() - start)
+    return result, 1e3 * float(np.median(seconds)) / len(mask)
 
 
 @torch.no_grad()
-def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int) -> dict[str, Solved]:
-    """Solve all problems that count with all solvers, which take turns on each batch."""
+def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int, times: int) -> dict[str, Solved]:
+    """Solve all problems that count with all solvers, which take turns on each batch. See :func:`measure`."""
     found = {}
     for spec in solvers:
         pose, ok = map_tensors(torch.zeros_like, (matches.problems.pose, matches.counts))
@@ -353,7 +356,7 @@ def solve(solvers: Mapping[str, nn.Module], matches: Matches, size: int) -> dict
             say(f"batch {number + 1} of {len(parts)}: {spec}")
             call(solver, spec, *take(given, slice(2)))  # not timed: slower
             one = found[spec]
-            result, one.milliseconds[at] = call(solver, spec, *given)
+            result, one.milliseconds[at] = call(solver, spec, *given, times=times if size > 1 else 1)
             one.pose.rotation[at] = rotation = result.rotation.double()
             one.pose.translation[at] = result.translation.double() - (rotation @ origin[..., None])[..., 0]
             one.ok[at] = result.ok
@@ -385,11 +388,14 @@ def load_solvers(specs: Sequence[str]) -> dict[str, nn.Module]:
 
 
 def measure(
-    matches: Matches, specs: Sequence[str], pictures: Path | None = None, sizes: Sequence[int] = (BATCH,)
+    matches: Matches, specs: Sequence[str], pictures: Path | None, sizes: Sequence[int], times: int
 ) -> dict[str, Any]:
-    """Solve the problems with all solvers, with each of the ``sizes`` of a call; draw failures into ``pictures``."""
+    """Solve the problems with all solvers, with each of the ``sizes`` of a call; draw failures into ``pictures``.
+
+    The time of a batch is the median of ``times`` calls. Times of single calls are means over all problems.
+    """
     solvers, chosen = load_solvers(specs), groups(matches)
-    solved = {size: solve(solvers, matches, size) for size in sizes}
+    solved = {size: solve(solvers, matches, size, times) for size in sizes}
     rows: list[dict[str, Any]] = []
     curves: dict[str, Any] = {}
     failures: list[dict[str, Any]] = []
@@ -399,20 +405,20 @@ def measure(
         predicted = matches.counts & one.probability.isfinite()
         if predicted.any():
             curve = reliability(one.probability[predicted], ~far[predicted])._asdict()
-            curves[spec] = {name: values.nan_to_num(0.0).tolist() for name, values in curve.items()}
+            curves.setdefault(spec, {name: values.nan_to_num(0.0).tolist() for name, values in curve.items()})
         for (kind, group), at in chosen.items():
             place = {"solver": spec, "kind": kind, "group": group, "batch": size, "count": int(at.sum())}
             rates = {"success": share(right[at]), "far": share(far[at])}
             oks = {"ok_of_right": share(one.ok[at & right]), "ok_of_far": share(one.ok[at & far])}
             ms = float(one.milliseconds[at].mean()) if at.any() else None
             rows.append({**place, **rates, **oks, "ms_per_problem": ms})
-        if pictures is not None and not failures:
+        if pictures is not None and (size, spec) == (sizes[0], specs[0]):
             failures = [draw_failure(matches, one, at, pictures) for at in worst_failures(matches, far)]
     return {"counts": describe(matches), "rows": rows, "reliability": curves, "failures": failures}
 
 
 @torch.no_grad()
-def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
+def measure_cost(matches: Matches, specs: Sequence[str], times: int) -> dict[str, Any]:
     """Time solvers on matches without a ratio test, by share of outliers and by number of pairs, in full batches."""
     solvers, chosen, rows = load_solvers(specs), groups(matches), []
     for group in (*BY_SHARE, *BY_PAIRS):
@@ -423,7 +429,7 @@ def measure_cost(matches: Matches, specs: Sequence[str]) -> dict[str, Any]:
         for spec, solver in solvers.items():
             say(f"{group}: {spec}")
             call(solver, spec, *take(given, slice(2)))  # not timed: slower
-            rows.append({"solver": spec, "group": group, "ms_per_problem": call(solver, spec, *given)[1]})
+            rows.append({"solver": spec, "group": group, "ms_per_problem": call(solver, spec, *given, times)[1]})
     return {"rows": rows}
 
 
@@ -514,6 +520,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         one.add_argument("problems", type=Path, nargs="+", help="files of `make`")
         one.add_argument("--solvers", nargs="+", required=True, help=f"names, with {CONFIDENCE} at the end")
         one.add_argument("--out", type=Path, required=True, help="the results file (.json)")
+        one.add_argument("--times", type=int, default=1, help="calls of a batch: their median counts")
     measuring.add_argument("--split", default="", help="whether the scenes were seen while choosing, in words")
     measuring.add_argument("--pictures", type=Path, help="folder for pictures of failures of the first solver")
     measuring.add_argument("--batch", type=int, nargs="+", default=[BATCH], help="problems in a call of ours")
@@ -523,12 +530,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     matches = read(options.problems)
     settings: dict[str, Any] = {"files": [path.name for path in options.problems], "solvers": options.solvers}
-    settings |= {"shares": SHARES, "pairs": PAIRS, "batch": COST_BATCH}
-    run: Callable[[], dict[str, Any]] = partial(measure_cost, matches, options.solvers)
+    settings |= {"shares": SHARES, "pairs": PAIRS, "batch": COST_BATCH, "times": options.times}
+    run: Callable[[], dict[str, Any]] = partial(measure_cost, matches, options.solvers, options.times)
     if options.command == "measure":
         settings |= {"split": options.split, "batch": options.batch, "dtype": "torch.float32"}
         settings |= {"inlier_px": INLIER_PX, "min_inliers": MIN_INLIERS, "right": RIGHT, "far": FAR}
-        run = partial(measure, matches, options.solvers, options.pictures, options.batch)
+        run = partial(measure, matches, options.solvers, options.pictures, options.batch, options.times)
     results = recorded(run, **settings)
     if options.command == "measure":
         print(format_results(results))

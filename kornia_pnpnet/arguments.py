@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -115,7 +116,7 @@ def checked_inputs(
 
     def one_batch(x: Tensor) -> Tensor:
         x = x if x.dtype in (dtype, torch.bool) else x.to(dtype)
-        return x if len(size) == 1 else x.reshape((size.numel(), *x.shape[len(size) :]))
+        return x if len(size) == 1 else x.reshape((math.prod(size), *x.shape[len(size) :]))
 
     per_pair = matrices if matrices.ndim == 2 or of_pair else matrices[..., None, :, :]
     cameras = per_pair.expand(*pairs, 3, 3) if is_rig else matrices.expand(*size, 3, 3)

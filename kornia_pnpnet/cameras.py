@@ -6,6 +6,7 @@ For a fisheye, the point therefore has the direction of the ray's (x, y). Its no
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -158,7 +159,7 @@ def bearings(
     check_shapes({name: (x, (*leading[name], *entries[name])) for name, x in given.items()})
     check_devices(given, img_points, "img_points")
     dtype = common_dtype({"img_points": img_points, **given})
-    pixels = img_points.to(dtype).reshape(size.numel(), *img_points.shape[-2:])
+    pixels = img_points.to(dtype).reshape(math.prod(size), *img_points.shape[-2:])
     for name, x in given.items():
         given[name] = x.to(dtype).expand(*size, *entries[name]).reshape(-1, *entries[name])
     point, found, _ = _through(given.get("dist"), given.get("fisheye"), pixels, given["intrinsics"])
@@ -279,7 +280,7 @@ def _lens(coefficients: Tensor | None, *, is_fisheye: bool) -> Callable[[Tensor]
     if coefficients is None:
         return lambda point: point
     if not is_fisheye:
-        eye = torch.eye(3, dtype=coefficients.dtype, device=coefficients.device).expand(len(coefficients), 3, 3)
+        eye = torch.eye(3, dtype=coefficients.dtype, device=coefficients.device).expand(coefficients.shape[0], 3, 3)
         return lambda point: distort_points(point, eye, coefficients)
 
     def distorted(point: Tensor) -> Tensor:

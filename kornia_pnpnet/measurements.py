@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from kornia.core.check import KORNIA_CHECK
 from kornia.core.exceptions import TypeCheckError, ValueCheckError
@@ -84,7 +86,7 @@ def heatmap_keypoints(
     logits = heatmaps.to(common_dtype(tensors)) / temperature
     check_shapes({"heatmaps / temperature": (logits, tuple(heatmaps.shape))})
     *size, height, width = heatmaps.shape
-    share = spatial_softmax2d(logits.reshape(heatmaps.shape[:-3].numel(), *heatmaps.shape[-3:]))
+    share = spatial_softmax2d(logits.reshape(math.prod(heatmaps.shape[:-3]), *heatmaps.shape[-3:]))
     mean = spatial_expectation2d(share, normalized_coordinates=False)  # (B, N, 2), cells
     u = torch.arange(width, dtype=share.dtype, device=share.device) - mean[..., :1]  # (B, N, W)
     v = torch.arange(height, dtype=share.dtype, device=share.device) - mean[..., 1:]  # (B, N, H)

@@ -97,8 +97,8 @@ class PnPNet(PretrainedMixin):
             estimates the noise and the refinement has iterations. Unless the effort is ``"fixed"``, the work varies in
             two more steps: in evaluation mode, poses are compared with rival poses (see
             :func:`~kornia_pnpnet.propose.alternatives.reconsider`); for rigs and bearings, RANSAC chooses the number of
-            its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in
-            ``torch.func.vmap`` and on the device ``meta``.
+            its samples. The effort is always fixed in exported graphs, with ``compile(whole=True)``, in your own
+            ``torch.compile``, in ``torch.func.vmap`` and on the device ``meta``.
         gradient: which problems have a gradient. ``"ok"``: only problems whose result is ``ok``. If no problem of the
             first batches with gradients of the inputs is ``ok``, a ``RuntimeWarning`` is issued. ``"always"``: all
             valid problems, but the gradients of a problem's loss with respect to normalised inputs are limited to a

@@ -252,7 +252,8 @@ def run(
     lap("matching")
     kept = [choose(x, calibration) for x in matched]
     lap("confidence")
-    solve(solver, photos[:1], kept[:1], batch)  # the first call of a process takes longer
+    solve(solver, photos[:1], kept[:1], batch)  # the first calls of a process take longer
+    solve_by_colmap(photos[:1], kept[:1])
     lap("preparation")
     result = solve(solver, photos, kept, batch)
     lap(OURS)

@@ -473,6 +473,7 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
 
 # A solver with more inputs keeps its colour and has another marker and line.
 _RAW_LOOKS = {"+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"}, "=fixed": {"marker": "^"}}
+_RAW_LOOKS |= {"min_iterations=100,": {"linestyle": ":"}}
 
 
 def grouped(rows: Iterable[Mapping[str, Any]], *keys: str) -> dict[Any, list[Mapping[str, Any]]]:

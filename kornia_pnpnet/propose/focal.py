@@ -170,7 +170,7 @@ def _with_distortion(problem: Problem, pose: Pose, radial: int) -> State:
 
     The scale of the kernel is proportional to the median residual, with a lower bound that shrinks at each step.
     """
-    state = State(pose, problem.weights.new_zeros(len(problem.weights), 1 + radial))
+    state = State(pose, problem.weights.new_zeros(problem.weights.shape[0], 1 + radial))
     limit = _WIDE
     for _ in range(_STEPS):
         projection = project(state, problem)

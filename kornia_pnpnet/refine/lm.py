@@ -207,12 +207,11 @@ class RobustWeightedLM(Configured):
         check_whole(0, m=m, by_residual=by_residual)
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
-        KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
+        self.backward = backward
         self.m = m
         self.explored = 7 * m // 10
         self.by_residual = min(by_residual, m - self.explored)
         self.additive = update == "additive"
-        self.backward = backward
         self.reject_worse = reject_worse
         size = 1 if shared or m == 0 else m
         shape = self.kernel.default if robustness is None else robustness
@@ -233,6 +232,16 @@ class RobustWeightedLM(Configured):
         count = max(self.m, 1)
         step, damping, shape = (p().to(like).expand(count) for p in (self.step, self.damping, self.robustness))
         return step, damping, shape
+
+    @property
+    def backward(self) -> str:
+        """How gradients are computed, as the argument. Copies and saved solvers keep a change."""
+        return str(self.config["backward"])
+
+    @backward.setter
+    def backward(self, backward: str) -> None:
+        KORNIA_CHECK(backward in BACKWARDS, f"backward must be one of {BACKWARDS}, got {backward!r}.")
+        self.config["backward"] = backward
 
     def with_iterations(self, m: int) -> RobustWeightedLM:
         """Return a copy with ``m`` iterations. Additional iterations repeat the hyperparameters of the last iteration.
