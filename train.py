@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shlex
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import hydra
@@ -24,6 +26,7 @@ from kornia_pnpnet.evaluation.results import differences
 from kornia_pnpnet.solver import PnPNet
 from kornia_pnpnet.training import TrainingError, fit
 from kornia_pnpnet.training.card import write_model_card
+from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME
 from kornia_pnpnet.training.results import RESULTS_NAME, find_results, load_run, run_results, summarize_runs
 
 log = logging.getLogger("train")
@@ -55,6 +58,8 @@ def main(config: DictConfig) -> float | None:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     model = instantiate(config.model.solver)
+    with TemporaryDirectory() as temporary, torch.random.fork_rng(devices=[]):
+        model.save_pretrained(temporary)  # what cannot be saved is refused before the training
     origin = start = None
     if config.weights is not None:
         try:
@@ -82,6 +87,8 @@ def main(config: DictConfig) -> float | None:
     identity = {"data": resolved["data"]["train"], "loss": resolved["loss"], "model_config": resolved["model"]}
     settings = instantiate(config.train, _convert_="all")
     try:
+        if (folder / RESULTS_NAME).exists() and not (folder / CHECKPOINT_NAME).exists():
+            raise TrainingError(f"{folder} has results and no checkpoint to continue from: choose another folder.")
         report = fit(
             model,
             instantiate(config.data.train),
@@ -116,11 +123,15 @@ def main(config: DictConfig) -> float | None:
             if sweeps:
                 raise
             sys.exit(str(error))
-    if results is not None and results.run.update == report.update:
+        if results.run.update != report.update:
+            results = None
+    sets = json.loads(json.dumps(resolved["data"]["validation"]), parse_constant=str)  # as `run_results` stores them
+    if results is not None and to_json(results)["config"]["data"]["validation"] == sets:
         log.info("Nothing is left to train; the results stay as they are.")
     else:
         log.info("Measuring success and speed of the trained solver")
-        results = run_results(model.cpu(), validation, report, resolved, list(runtime.overrides.task), origin)
+        run = report if results is None else results.run
+        results = run_results(model.cpu(), validation, run, resolved, list(runtime.overrides.task), origin)
         model.save_pretrained(folder / "weights")
         write_model_card(folder / "weights", results)
         write_json(folder / RESULTS_NAME, to_json(results))  # the last file: a run without it is measured again

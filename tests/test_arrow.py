@@ -44,7 +44,6 @@ def draw(make_problems):
 
 
 def numbers(table, name):
-    """A column of lists of the same length as an array."""
     return np.array(table[name].to_pylist())
 
 

@@ -229,7 +229,6 @@ def test_bearings_in_every_direction(name, uniform):
 
 
 def rig(batch, n, cameras, base, outlier_share=0.0):
-    """Problems of a rig, without noise."""
     options = {"cameras": cameras, "baseline": base, "outlier_share": outlier_share, "img_sigma": 0.0}
     return CameraProblems(n=n, batch_size=batch, seed=0, dtype=torch.float64, **options).batch(0)
 

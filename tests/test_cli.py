@@ -102,7 +102,6 @@ def csv_file(tmp_path, problem):
 
 @pytest.fixture
 def weights_folder(tmp_path):
-    """An untrained network with a refinement, as a folder of weights."""
     torch.manual_seed(1)
     PnPNet(MLPInit(n=9), RobustWeightedLM(m=5)).save_pretrained(tmp_path / "weights")
     return tmp_path / "weights"

@@ -15,9 +15,11 @@ from torch._dynamo.testing import CompileCounter
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.torch_version import TorchVersion
 
-from kornia_pnpnet import PnPNet, RobustWeightedLM, create_solver
+from kornia_pnpnet import PnPNet, Pose, RobustWeightedLM, create_solver, pose_covariance
+from kornia_pnpnet.cameras import bearings
 from kornia_pnpnet.core.performance import INLINE, Runner, ascending_order, in_order, in_turn, ranked
 from kornia_pnpnet.data import CameraProblems, OutlierMix, SyntheticProblems
+from kornia_pnpnet.measurements import heatmap_keypoints
 
 # torch.compile makes an instance of an autograd function while it looks into it.
 pytestmark = pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
@@ -258,10 +260,10 @@ def kernels(program):
     return {node.target for node in program.graph.nodes if node.op == "call_function"} & set(INLINE)
 
 
-def export(function, *inputs):
+def export(function, *inputs, **options):
     module = nn.Module()
     module.forward = lambda *x: function(*x)  # noqa: PLW0108 - built-in functions have no signature
-    return torch.export.export(module, inputs)
+    return torch.export.export(module, inputs, **options)
 
 
 A, B = torch.linspace(-1.0, 2.0, 24).sin().view(2, 3, 4), torch.linspace(-3.0, 1.0, 40).cos().view(2, 4, 5)
@@ -282,6 +284,17 @@ def test_operations_that_are_inlined_give_the_same_results(function, inputs):
     assert not kernels(inlined)
     expected, found = program.module()(*inputs), inlined.module()(*inputs)
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+
+
+@of_the_exporter
+def test_functions_are_exported_for_any_batch():
+    (w, x, k, pose), dist = problems(4)[:4], torch.full((4, 5), 0.01, dtype=torch.float64)
+    calls = [(lambda *x: pose_covariance(Pose(*x[:2]), *x[2:], img_sigma=1.0), (*pose, w, x, k))]
+    calls += [(lambda x, k, d: bearings(x, k, dist=d), (x, k, dist)), (heatmap_keypoints, (x[:, None],))]
+    for function, inputs in calls:
+        sizes = (({0: torch.export.Dim("batch", min=2)},) * len(inputs),)
+        program, twice = export(function, *inputs, dynamic_shapes=sizes).module(), [torch.cat((x, x)) for x in inputs]
+        torch.testing.assert_close(program(*twice), function(*twice))
 
 
 @of_the_exporter

@@ -224,9 +224,6 @@ def test_the_number_of_outliers_is_uniform_or_exact():
         assert counts(OutlierMix(count=count)).tolist() == [0] * count + [COUNT]
     with pytest.raises(BaseError, match=r"10 outliers.*9"):
         counts(OutlierMix(count=10))
-
-
-def test_the_largest_number_of_outliers():
     assert all(OutlierMix(max_ratio=0.33).max_count(n) == OutlierMix().max_count(n) == n // 3 for n in range(3, 16))
     assert [OutlierMix().max_count(n) for n in (20, 21, 50, 51)] == [6, 7, 16, 17]
     assert [OutlierMix(max_ratio=0.6, min_inliers=4).max_count(n) for n in (3, 6, 20)] == [0, 2, 12]
@@ -347,7 +344,7 @@ def thinness(points):
     return values[:, 2] / values[:, 0]
 
 
-def test_slabs_are_in_view_and_in_front(generator):
+def test_slabs_and_objects_are_in_view_and_in_front(generator):
     points = data.SlabPoints()(COUNT, 9, generator)
     assert points[..., 2].min() > 1.0
     tangent = points[..., :2] / points[..., 2:]
@@ -357,9 +354,7 @@ def test_slabs_are_in_view_and_in_front(generator):
     relative_depth = points[..., 2].amax(1) / points[..., 2].amin(1)
     assert (relative_depth < 1.3).double().mean() > 0.05
     assert (relative_depth > 3.0).double().mean() > 0.05
-
-
-def test_objects_are_in_view_and_some_are_planar(generator):
+    # Objects are in view, and some are planar.
     points = data.ObjectPoints()(COUNT, 12, generator)
     centre = points.mean(1)
     assert 0.5 < centre[:, 2].min() < centre[:, 2].max() < 41
@@ -402,7 +397,6 @@ def test_surfaces_have_their_shapes(generator):
 
 
 def mixed(shares=None, **chosen):
-    """A mixture of three sources."""
     planes = [partial(SyntheticProblems, points=plane, world_sigma=0.0) for plane in PLANES]
     return data.MixedProblems(planes, shares=shares, batch_size=60, seed=7, n=4, dtype=torch.float64, **chosen)
 
@@ -421,9 +415,6 @@ def test_mixed_sources_do_not_see_the_same_random_numbers_and_stay_whole():
     p = map_tensors(lambda *x: torch.cat(x), *(source.batch(i) for i in range(3)))
     assert len(p.pose.translation.unique(dim=0)) == 180
     assert torch.equal(reprojection_errors(p).norm(dim=-1) < 1e-6, p.inliers)
-
-
-def test_shares_that_do_not_fit_raise():
     for count, shares in ((0, None), (2, (1.0,)), (2, (1.0, 0.0)), (2, (1.0, -1.0))):
         with pytest.raises(BaseError, match=f"{count} sources"):
             data.MixedProblems([SyntheticProblems] * count, shares=shares)

@@ -124,7 +124,6 @@ def run(tmp_path, name, *arguments, results=None):
 
 
 def printed(tmp_path, name, *arguments):
-    """What a short program prints."""
     command = [sys.executable, EXAMPLES / f"{name}.py", *map(str, arguments)]
     return subprocess.run(command, check=True, cwd=tmp_path, stdout=subprocess.PIPE, text=True).stdout
 

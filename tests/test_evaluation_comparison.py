@@ -168,7 +168,6 @@ def test_the_digest_of_the_code_covers_python_files_and_their_places(tmp_path, m
 
 
 def without_times(results):
-    """The results without times and environment."""
     rows = [{key: value for key, value in row.items() if key != "us_per_problem"} for row in results["rows"]]
     return {**results, "rows": rows, "environment": None}
 
@@ -203,7 +202,6 @@ def test_solvers_and_sets_may_be_added(path):
 
 
 def other(function=lambda part: part, **changes):
-    """Change the problems or a field of the data set ``clean``."""
     changed = CLEAN["clean"]._replace(problems=map_tensors(function, CLEAN["clean"].problems), **changes)
     return lambda _, data, __: data.update(clean=changed)
 

@@ -183,7 +183,6 @@ WRONG: tuple[Callable[[Tensor], Any], ...] = (
 
 
 def draw(seed: int) -> Call:
-    """The call of a seed."""
     rng = random.Random(seed)
     often = lambda share: rng.random() < share  # noqa: E731
     name = rng.choice(OURS if often(0.55) else [*TARGETS])
@@ -318,7 +317,6 @@ def flat(call: Call, function: Callable[[Tensor], Tensor] = lambda x: x) -> dict
 
 
 def run(call: Call, args: Any = None, size: tuple[int, ...] | None = None, context: Any = None) -> Any:
-    """The outputs with one batch dimension."""
     torch.manual_seed(0)
     size = call.size if size is None else size
     with context or nullcontext():
@@ -343,7 +341,6 @@ def same(found: Any, expected: Any, tolerance: float = 0.0) -> None:
 
 
 def is_sound(call: Call, found: Any) -> None:
-    """Shapes, dtypes and finite numbers."""
     tensors = [x for x in pytree.tree_leaves(found) if isinstance(x, Tensor) and x.is_floating_point()]
     batch, fine = prod(call.size), [i for i in range(prod(call.size)) if i not in call.spoiled]
     if not isinstance(found, PnPResult):

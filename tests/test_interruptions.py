@@ -35,7 +35,6 @@ def train(folder, updates=40, resume=False, **changes):
 
 
 def assert_same_runs(folder, other):
-    """The weights and the learning curves, except what depends on the clock."""
     assert_same(*(torch.load(x / CHECKPOINT_NAME, weights_only=True)["model"] for x in (folder, other)))
     assert comparable(read_history(folder)) == comparable(read_history(other))
 

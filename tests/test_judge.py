@@ -36,20 +36,18 @@ def found(problem, pose, known=False):
     return evidence(at_pose(State.of(pose), problem, votes), problem, votes)
 
 
-def test_given_noise_is_kept_unless_the_residuals_contradict():
+def test_given_noise_is_kept_unless_the_residuals_contradict(make_problems):
     problem, pose = scene(60, 20, 1.0)
     for given, factor in ((1.0, 1.0), (2.0, 1.0), (0.1, 64.0)):
         noise = Noise(torch.full_like(problem.weights, given), torch.zeros_like(problem.weights))
         result = found(problem._replace(noise=noise), pose, known=True)
         assert (result.mixture.variance == factor).all()
         assert 1000.0 * result.sigma.median() == pytest.approx(1.0, rel=0.1)
-
-
-def test_exact_points_are_found_to_be_exact_beside_covariances_of_pixels(make_problems):
+    # Exact points are found to be exact beside covariances of pixels.
     p, solver = make_problems(50, 20, img_sigma=0.5, world_sigma=0.0), create_solver("pnpnet-set")
     covariances = 0.25 * torch.eye(2).double().expand(20, 50, 2, 2)
-    expected, found = solver(*p[:3], img_sigma=0.5), solver(*p[:3], img_cov=covariances)
-    assert (found.matrix - expected.matrix).abs().amax((1, 2)).median() < 1e-4
+    expected, exact = solver(*p[:3], img_sigma=0.5), solver(*p[:3], img_cov=covariances)
+    assert (exact.matrix - expected.matrix).abs().amax((1, 2)).median() < 1e-4
 
 
 def test_evidence_rises_with_pairs_and_falls_with_noise_and_with_an_incorrect_pose(perturb):

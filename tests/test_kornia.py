@@ -60,7 +60,6 @@ class BaseTester:
 
 
 def run(folder, *command, **environment):
-    """What a command prints that must succeed."""
     options = {"cwd": folder, "env": {**os.environ, **environment}, "capture_output": True, "text": True}
     done = subprocess.run(command, check=False, **options)
     assert done.returncode == 0, (done.stderr + done.stdout)[-4000:]

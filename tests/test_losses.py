@@ -76,7 +76,6 @@ def test_lengths_neither_overflow_nor_underflow(unit):
 
 
 def scaled(pose):
-    """The pose in a unit of the world that is a thousandth."""
     return Pose(pose.rotation, 1000.0 * pose.translation)
 
 

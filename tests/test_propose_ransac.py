@@ -49,7 +49,6 @@ def wide(batch, seed=0):
 
 
 def protocol(batch, seed=0):
-    """The package's own problems without noise."""
     exact = {"img_sigma": 0.0, "world_sigma": 0.0, "dtype": torch.float64}
     p = SyntheticProblems(n=3, batch_size=batch, seed=seed, **exact).batch(0)
     return p.world_points, p.img_points / p.intrinsics[:, :1, :1], p.pose

@@ -281,10 +281,12 @@ SAVED += [type("Sub", (PnPNet,), {"__init__": lambda self, *a, **x: PnPNet.__ini
 @pytest.mark.parametrize("solver", SAVED)
 def test_saving_and_loading_keeps_every_option_and_every_bit(solver, tmp_path, make_problems):
     solver, p = solver().eval(), make_problems(6)
+    solver.refine.backward = "implicit"
     solver.save_pretrained(tmp_path / "deep" / "folder")
     again = PnPNet.from_pretrained(str(tmp_path / "deep" / "folder"))
     assert again.config() == solver.config() == solver.with_options().config()
     assert again.options == solver.options
+    assert again.refine.backward == again.refine.with_iterations(9).backward == "implicit"
     assert not again.training
     assert_same(again(*p[:3]), solver(*p[:3]))
     solver.compile()

@@ -90,6 +90,13 @@ def test_run_writes_results_and_resumes(tmp_path, train):
     assert "resume=true" in log.read_text()
     train(*command, "resume=true")
     assert log.read_text().count("Weights, model card and results are in") == 2
+    train(*command, "resume=true", "+data.validation.mine=${data.validation.none}")  # a further set is measured
+    assert load_run(tmp_path / "results.json").run == results.run
+    assert "mine" in load_run(tmp_path / "results.json").validation
+    (tmp_path / "last.ckpt").unlink()
+    with pytest.raises(SystemExit, match=r"^1$"):
+        train(*command, "resume=true")
+    assert "results and no checkpoint" in log.read_text()
 
 
 def test_run_starts_from_weights(tmp_path, train):

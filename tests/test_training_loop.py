@@ -133,8 +133,10 @@ def test_a_checkpoint_is_continued_by_the_same_run_only(tmp_path):
         with pytest.raises(TrainingError, match=rf"of another run: model\.{option} was .* and is {value!r}\.$"):
             fit(folder=tmp_path, identity=identity, resume=True, **{**make_parts(), "model": other})
     assert (tmp_path / CHECKPOINT_NAME).read_bytes() == content
-    report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **make_parts())
+    free = {**make_parts(max_skipped=7, log_every=2, validate_every=2, checkpoint_every=5), "validation": {}}
+    report = fit(folder=tmp_path, identity={"data": {"seed": 3, "sigma": (1.0, 2.0)}}, resume=True, **free)
     assert (report.start, report.update) == (6, 6)
+    assert read_history(tmp_path)[-1]["val/none/success"]  # curves of removed sets stay
 
 
 def test_a_run_becomes_longer_with_the_schedule_of_the_longer_run(tmp_path):

@@ -31,8 +31,8 @@ class MixedProblems:
     Args:
         sources: constructors of the sources, called with ``batch_size``, ``seed`` and ``options``. A constructor is
             :class:`SyntheticProblems` or a :func:`functools.partial` of :class:`SyntheticProblems`.
-        shares: one positive number per source. The number of problems of a source is proportional to its share.
-            ``None`` means equal shares.
+        shares: one positive number per source. The number of problems of a source is proportional to its share
+            and rounded: a small batch may have no problem of a source. ``None`` means equal shares.
         batch_size: number of problems per batch.
         seed: seed of the stream.
         options: further arguments of all constructors.

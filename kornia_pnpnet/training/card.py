@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 from kornia_pnpnet.core.files import atomic_open
@@ -69,13 +70,13 @@ def write_model_card(folder: str | Path, results: RunResults, *, name: str | Non
 
 def _describe(results: RunResults) -> str:
     """Describe a run in one line with its command. Absolute paths become ``PATH``, except ``weights`` of known runs."""
-    words = ["python train.py"]
+    words = ["python", "train.py"]
     for override in results.overrides:
         key, _, value = override.partition("=")
-        if key == "weights" and results.origin is not None and _PATH.fullmatch(value):
+        if key == "weights" and results.origin is not None and (value.startswith("outputs/") or _PATH.fullmatch(value)):
             words.append(f"weights=outputs/{results.origin.name}/weights")  # where `train.py` writes weights
         elif key not in HOW_IT_RAN:
             words.append(_PATH.sub("PATH", override))
     start = f", from the weights of {results.origin.name}" if results.origin else ""
     made = f"{results.run.update} updates{start}, commit {results.environment['commit']}"
-    return f"{results.name}: `{' '.join(words)}` ({made})"
+    return f"{results.name}: `{shlex.join(words)}` ({made})"

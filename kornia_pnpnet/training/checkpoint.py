@@ -69,12 +69,13 @@ class History:
     """Learning curves in a CSV file and in TensorBoard. Earlier rows with ``update > start`` are removed."""
 
     def __init__(self, folder: Path, columns: list[str], start: int) -> None:
-        self._path, self._columns = folder / HISTORY_NAME, columns
+        self._path, self._columns = folder / HISTORY_NAME, [*columns]
         rows: list[dict[str, Any]] = []
         if start and self._path.is_file():
             with self._path.open(newline="", encoding="utf-8") as file:  # a crash can cut the last row
                 rows = [row for row in csv.DictReader(file) if None not in row.values() and int(row["update"]) <= start]
-        write_csv(self._path, columns, rows)
+        self._columns += [name for name in (rows[0] if rows else ()) if name not in columns]  # of removed sets
+        write_csv(self._path, self._columns, rows)
         self.board = SummaryWriter(folder / "tensorboard", purge_step=start + 1)
 
     def write(self, row: dict[str, float]) -> None:
@@ -87,15 +88,21 @@ class History:
                 self.board.add_scalar(key, value, int(row["update"]))
 
 
+# Settings that may change when a run continues. The weights do not depend on them.
+_FREE = ("max_skipped", "log_every", "validate_every", "checkpoint_every")
+
+
 def load_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """Read a checkpoint.
 
-    Raise ``TrainingError`` if the file is damaged or has another identity. Fewer ``updates`` in the file are allowed.
+    Raise ``TrainingError`` if the file is damaged or has another identity. Fewer ``updates`` in the file are allowed,
+    and other values of ``_FREE``.
     """
+    now = identity["settings"]
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        settings = dict(state["identity"]["settings"])
-        settings["updates"] = max(settings["updates"], identity["settings"]["updates"])  # a run may become longer
+        settings = state["identity"]["settings"] | {name: now[name] for name in _FREE}
+        settings["updates"] = max(settings["updates"], now["updates"])  # a run may become longer
         found = differences({**state["identity"], "settings": settings}, identity)
     except Exception as error:  # torch.load raises many types of errors on a damaged file
         raise TrainingError(f"Cannot read the checkpoint {path}: {error}") from error

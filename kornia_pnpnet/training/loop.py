@@ -149,8 +149,9 @@ def fit(
         folder: folder of the run.
         fabric: a launched Lightning Fabric. ``None`` means one process on the CPU.
         identity: plain data that describe the run, for example the configuration of the data. A run can be continued
-            only with the same ``identity`` and the same settings, except that ``settings.updates`` may grow. With
-            more updates, the learning rates and the ramp follow the schedule of the longer run.
+            only with the same ``identity`` and the same settings, except ``max_skipped`` and the numbers of updates
+            between rows, validations and checkpoints. ``settings.updates`` may grow; the learning rates and the
+            ramp then follow the schedule of the longer run.
         data_workers: number of worker processes per training process. The workers draw the next batches.
         resume: continue from the checkpoint in ``folder`` if it exists.
         progress: show a progress bar.
@@ -159,13 +160,10 @@ def fit(
         TrainingError: when ``folder`` holds a checkpoint but ``resume`` is false; when the checkpoint is damaged, or
             its settings, solver options or ``identity`` differ from those of this call; or when more than
             ``settings.max_skipped`` steps were skipped.
-        BaseError: when the batch size is not a multiple of the number of processes.
     """
     fabric = fabric or Fabric(accelerator="cpu", devices=1)
-    KORNIA_CHECK(
-        data.batch_size % fabric.world_size == 0,
-        f"A batch of {data.batch_size} cannot be shared equally among {fabric.world_size} processes.",
-    )
+    if fabric.device.type == "cuda":  # another run of this process may have used more memory
+        torch.cuda.reset_peak_memory_stats(fabric.device)
     checkpoint = Path(folder) / CHECKPOINT_NAME
     described = {"settings": asdict(settings), "model": model.config(), **(identity or {})}
     described = json.loads(json.dumps(described))  # JSON turns tuples into lists
@@ -305,7 +303,7 @@ def fit(
 def _own_part(batch: Problems, fabric: Fabric) -> tuple[Problems, float]:
     """Take this process's part of a batch. Also return the factor of its mean loss in the mean of all processes.
 
-    Batches of `VaryingSize` cannot always be shared equally. A process without a problem gets one with the factor 0.
+    A batch cannot always be shared equally. A process without a problem gets one with the factor 0.
     """
     own = slice(fabric.global_rank, None, fabric.world_size)
     number = len(batch.inliers[own])
