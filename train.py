@@ -7,6 +7,7 @@ import logging
 import os
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -87,7 +88,7 @@ def main(config: DictConfig) -> float | None:
     identity = {"data": resolved["data"]["train"], "loss": resolved["loss"], "model_config": resolved["model"]}
     settings = instantiate(config.train, _convert_="all")
     try:
-        if (folder / RESULTS_NAME).exists() and not (folder / CHECKPOINT_NAME).exists():
+        if settings.updates and (folder / RESULTS_NAME).exists() and not (folder / CHECKPOINT_NAME).exists():
             raise TrainingError(f"{folder} has results and no checkpoint to continue from: choose another folder.")
         report = fit(
             model,
@@ -130,8 +131,11 @@ def main(config: DictConfig) -> float | None:
         log.info("Nothing is left to train; the results stay as they are.")
     else:
         log.info("Measuring success and speed of the trained solver")
-        run = report if results is None else results.run
+        made = results
+        run = report if made is None else made.run
         results = run_results(model.cpu(), validation, run, resolved, list(runtime.overrides.task), origin)
+        if made is not None:  # the weights are of the commit that trained them
+            results = replace(results, environment=results.environment | {"commit": made.environment["commit"]})
         model.save_pretrained(folder / "weights")
         write_model_card(folder / "weights", results)
         write_json(folder / RESULTS_NAME, to_json(results))  # the last file: a run without it is measured again

@@ -13,6 +13,7 @@ The error is the rotation error in radians plus the translation error relative t
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -115,14 +116,11 @@ def measure(path: Path) -> dict[str, Any]:
     found, chosen = ways(seen, inlier_px)
     scores, rows = {name: solve(new, way) for name, way in found.items()}, []
     cluster = new["cluster"].unique(return_inverse=True)[1].numpy()
-
-    def less(values: Tensor, others: Tensor) -> list[float]:
-        return interval(np.bincount(cluster, (values - others).numpy()), np.bincount(cluster))
-
+    sums, sizes = partial(np.bincount, cluster), np.bincount(cluster)
     for name, one in scores.items():
         row = {key: float(value.mean()) for key, value in one.items()} | {"median": float(one["error"].median())}
-        below = {base: {key: less(v, scores[base][key]) for key, v in one.items()} for base in BASES}
-        rows.append({"way": name, **row, "less": below})
+        less = {b: {k: interval(sums((v - scores[b][k]).numpy()), sizes) for k, v in one.items()} for b in BASES}
+        rows.append({"way": name, **row, "less": less})
     inliers = (reprojection(new) < inlier_px)[new["mask"]].double()
     counts = {"seen": len(seen["t"]), "measured": len(new["t"]), "clusters": len(new["cluster"].unique())}
     share = {"pairs": len(inliers) / len(new["t"]), "inliers": float(inliers.mean())}

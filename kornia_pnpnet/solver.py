@@ -82,7 +82,8 @@ class PnPNet(PretrainedMixin):
     the computation. Integer inputs are converted. Inputs in float16 or bfloat16 are also converted, because half
     precision has too few digits for a pixel. The gradient of each input has the dtype of the input.
     :class:`torch.autocast` does not change the results. If no tensor requires a gradient, the layer computes in
-    :class:`torch.inference_mode` and returns ordinary tensors.
+    :class:`torch.inference_mode` and returns ordinary tensors. Forward hooks of the parts then get
+    inference tensors. Forward hooks of ``refine`` are never called.
 
     Args:
         init: the initialiser, which maps a :class:`~kornia_pnpnet.problem.Problem` to

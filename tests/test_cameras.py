@@ -38,7 +38,6 @@ def uniform(generator):
 
 
 def seen(uniform, batch, n):
-    """World points, undistorted pixels and poses of the camera."""
     pixels = torch.stack((uniform(batch, n, low=20, high=620), uniform(batch, n, low=20, high=460)), -1)
     rays = convert_points_to_homogeneous(pixels) @ torch.linalg.inv(CAMERA).mT
     pose = Pose(axis_angle_to_rotation_matrix(uniform(batch, 3)), 2.0 * uniform(batch, 3))

@@ -23,6 +23,7 @@ from kornia_pnpnet.data import OutlierMix, SyntheticProblems, VaryingSize
 from kornia_pnpnet.data.stream import stream_batches
 from kornia_pnpnet.training import TrainSettings, fit, train_briefly
 from kornia_pnpnet.training.checkpoint import CHECKPOINT_NAME, HISTORY_NAME, TrainingError
+from kornia_pnpnet.training.loop import _own_part
 
 SHARES = [f"{stage}_share" for stage in ("data", "forward", "backward", "optimizer", "rest")]
 #: Signals, and the numbers of workers before and after.
@@ -240,11 +241,11 @@ def test_shares_of_the_time_add_up_and_show_slow_data(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("batch_size", "processes"), [(15, 2), (2, 4)])
-def test_a_batch_that_cannot_be_shared_equally_is_refused_before_training(batch_size, processes, tmp_path):
-    parts = {**make_parts(), "data": SyntheticProblems(n=6, batch_size=batch_size)}
-    with pytest.raises(BaseError, match=rf"{batch_size}.*{processes} processes"):
-        fit(folder=tmp_path, fabric=SimpleNamespace(world_size=processes), **parts)
-    assert list(tmp_path.iterdir()) == []
+def test_the_mean_over_processes_is_that_of_the_batch(batch_size, processes):
+    batch = SyntheticProblems(n=6, batch_size=batch_size).batch(0)
+    fabrics = [SimpleNamespace(world_size=processes, global_rank=i, device="cpu") for i in range(processes)]
+    means = [factor * part.world_points.mean() for part, factor in (_own_part(batch, fabric) for fabric in fabrics)]
+    torch.testing.assert_close(sum(means) / processes, batch.world_points.mean())
 
 
 class BrokenSource(SyntheticProblems):

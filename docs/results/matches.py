@@ -18,18 +18,18 @@ UNSEEN, SEEN = "real_matches", "real_matches_seen"
 BATCH = 500  # problems in a call of ours
 SCORES = "scores"  # end of the title of a solver that got a score for each pair
 WITH_SCORES = f"{ANY}+ratio"
-_TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known"}
+_TITLES = {"poselib": "PoseLib", "opencv-usac": "OpenCV USAC", "known-inliers": "inliers known", "pycolmap": "pycolmap"}
 
 
 def title(solver: str) -> str:
     """The name of a solver for tables."""
     spec, _, known = solver.partition("+")
     name, _, options = spec.partition(":")
-    parts = [_TITLES.get(name, name if name == "pycolmap" else f"`{name}`")]
-    parts += ["fixed effort"] if "effort=fixed" in options else []
+    parts = [_TITLES.get(name, f"`{name}`"), *["fixed effort"] * ("effort=fixed" in options)]
     parts += [f"{pixels} px" for pixels in re.findall(r"threshold=(\d+)", options)]
     parts += [f"loss {pixels} px" for pixels in re.findall(r"loss_scale=(\d+)", options)]
     parts += ["few samples"] if "max_iterations=10000," in f"{options}," else []
+    parts += ["100 000 samples"] if "iterations=100000" in options and name != "poselib" else []
     return ", ".join(filter(None, (*parts, SCORES if known else "")))
 
 

@@ -16,6 +16,7 @@ _TAGS = ["camera-pose-estimation", "kornia", "perspective-n-point", "pnp"]
 HOW_IT_RAN = ("resume", "progress", "threads", "data_workers", "compile")
 # Matches absolute paths, but not the slashes of a URL or of a relative path.
 _PATH = re.compile(r"(?:file://|(?<![\w./\\])(?:~|[A-Za-z]:)?)(?:/(?!/)|\\)[^\s,;'\"\]})]*")
+_OLD_PLACE = re.compile(r"outputs/[^/]*")  # where runs of early commits wrote weights
 _CARD = """---
 {metadata}
 ---
@@ -73,7 +74,7 @@ def _describe(results: RunResults) -> str:
     words = ["python", "train.py"]
     for override in results.overrides:
         key, _, value = override.partition("=")
-        if key == "weights" and results.origin is not None and (value.startswith("outputs/") or _PATH.fullmatch(value)):
+        if key == "weights" and results.origin is not None and (_PATH.fullmatch(value) or _OLD_PLACE.fullmatch(value)):
             words.append(f"weights=outputs/{results.origin.name}/weights")  # where `train.py` writes weights
         elif key not in HOW_IT_RAN:
             words.append(_PATH.sub("PATH", override))
