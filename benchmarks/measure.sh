@@ -82,10 +82,11 @@ if [ -n "${MATCHES:-}" ]; then
     done
     part seen benchmarks/real_matches.py measure "$MATCHES"/seen/*.npz --out docs/results/real_matches_seen.json \
         --split "Seen: scenes of earlier measurements; the options of other libraries were chosen here" \
-        --solvers $set_ $fixed p3p-ransac:threshold=4+ratio $grid known-inliers
-    p3p="p3p-ransac:threshold=4 p3p-ransac:threshold=4+ratio"
+        --solvers $set_ $fixed p3p-ransac:threshold=6+ratio $grid known-inliers
+    p3p="p3p-ransac:threshold=6 p3p-ransac:threshold=6+ratio"
     poselib="poselib:threshold=4,$fast poselib:threshold=3,$many"
-    others="pycolmap:threshold=3 opencv-usac:threshold=2"
+    others="pycolmap:threshold=8,loss_scale=1,max_iterations=10000"
+    others="$others pycolmap:threshold=3,loss_scale=1,max_iterations=100000 opencv-usac:threshold=2,iterations=100000"
     part unseen benchmarks/real_matches.py measure "$MATCHES"/unseen/*.npz --out docs/results/real_matches.json \
         --batch 500 1 --times 3 --pictures docs/results \
         --split "Unseen: nothing was chosen on these scenes" --solvers $set_ $fixed $p3p $poselib \

@@ -27,9 +27,7 @@ def title(solver: str) -> str:
     name, _, options = spec.partition(":")
     parts = [_TITLES.get(name, f"`{name}`"), *["fixed effort"] * ("effort=fixed" in options)]
     parts += [f"{pixels} px" for pixels in re.findall(r"threshold=(\d+)", options)]
-    parts += [f"loss {pixels} px" for pixels in re.findall(r"loss_scale=(\d+)", options)]
     parts += ["few samples"] if "max_iterations=10000," in f"{options}," else []
-    parts += ["100 000 samples"] if "iterations=100000" in options and name != "poselib" else []
     return ", ".join(filter(None, (*parts, SCORES if known else "")))
 
 
