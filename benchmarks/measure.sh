@@ -92,7 +92,7 @@ if [ -n "${MATCHES:-}" ]; then
         --split "Unseen: nothing was chosen on these scenes" --solvers $set_ $fixed $p3p $poselib \
         poselib:threshold=3,$many,progressive_sampling=true+ratio $others known-inliers
     part cost benchmarks/real_matches.py cost "$MATCHES"/unseen/*.npz --out docs/results/real_matches_cost.json \
-        --times 3 --solvers $set_ pnpnet-set:effort=fixed $p3p $poselib $others
+        --solvers $set_ pnpnet-set:effort=fixed $p3p $poselib $others
 else
     echo "Not measured without MATCHES: docs/results/real_matches.md"
 fi

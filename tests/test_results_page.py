@@ -283,7 +283,7 @@ def test_kinds_of_matches_are_summed_by_the_number_of_problems():
     ours = found["pnpnet-set"]
     assert [ours[kind].rate for kind in ("few", "many", "all")] == [0.9, 0.8, 0.825]
     assert (ours["few"].ms, ours["all"].ms, ours["all"].number) == (200.0, 500.0, 400)
-    assert matches.best_peer(found) == "poselib:threshold=6"
+    assert matches.by_success(found) == ["poselib:threshold=6", "poselib:threshold=6+ratio"]
     assert matches.points_ahead(file) == "+12.5 (+12.5 to +12.5)"  # one scene: any sample is the same
 
 

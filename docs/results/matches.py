@@ -59,10 +59,10 @@ def totals(results: Mapping[str, Any]) -> dict[str, dict[str, Total]]:
     return {name: {kind: total(rows) for kind, rows in kinds.items()} for name, kinds in found.items()}
 
 
-def best_peer(found: Mapping[str, Mapping[str, Total]]) -> str:
-    """The PoseLib with the highest success."""
-    peers = [name for name in found if name.startswith("poselib")]
-    return max(peers, key=lambda name: found[name]["all"].rate)
+def by_success(found: Mapping[str, Mapping[str, Total]]) -> list[str]:
+    """Other libraries, the one with the highest success first."""
+    others = [name for name in found if title(name)[0] != "`" and title(name) != _TITLES["known-inliers"]]
+    return sorted(others, key=lambda name: -found[name]["all"].rate)
 
 
 def by_scene(results: Mapping[str, Any], solver: str, kind: str = "") -> NDArray[np.float64]:
@@ -76,8 +76,8 @@ def by_scene(results: Mapping[str, Any], solver: str, kind: str = "") -> NDArray
 
 
 def points_ahead(results: Mapping[str, Any], ours: str = ANY) -> str:
-    """Percentage points by which one of our solvers has more success than the best PoseLib, and their interval."""
-    (mine, number), (theirs, _) = (by_scene(results, name) for name in (ours, best_peer(totals(results))))
+    """Percentage points by which one of our solvers has more success than the best library, and their interval."""
+    (mine, number), (theirs, _) = (by_scene(results, name) for name in (ours, by_success(totals(results))[0]))
     return "{:+.1f} ({:+.1f} to {:+.1f})".format(*interval(100.0 * (mine - theirs), number))
 
 
@@ -88,8 +88,7 @@ def overview(unseen: Mapping[str, Any], seen: Mapping[str, Any]) -> dict[str, An
     kinds = [kind for kind in batched[ANY] if kind != "all"]
     short = dict(zip(kinds, ("filtered", "raw"), strict=True))
     ours = [ANY, WITH_SCORES]
-    others = [name for name in batched if title(name)[0] != "`" and title(name) != _TITLES["known-inliers"]]
-    others.sort(key=lambda name: -batched[name]["all"].rate)
+    others = by_success(batched)
     rates = [interval(*by_scene(unseen, name, kind)) for name in (*ours, *others) for kind in kinds]
     ahead = {}
     for kind in kinds:
@@ -125,7 +124,7 @@ def page_facts(
     kinds = [kind for kind in found[ANY] if kind != "all"]
     return {
         **{"first": first, "solver": title(ANY), "kinds": kinds, "costs": costs},
-        **{"raw": find_rows(first, kinds[1])[ANY]["all"], "peer": best_peer(found), "keypoints": keypoints},
+        **{"raw": find_rows(first, kinds[1])[ANY]["all"], "peer": by_success(found)[0], "keypoints": keypoints},
         "totals": dict(sorted(found.items(), key=lambda item: -item[1]["all"].rate)),
         "files": [facts(name, at_size(one), kinds) for name, one in ((UNSEEN, unseen), (SEEN, seen))],
         "scenes": {row["scene"]: row for row in read_csv(HERE / "real_matches_scenes.csv", ()).values()},
@@ -136,9 +135,9 @@ def page_facts(
 
 
 def facts(name: str, results: Mapping[str, Any], kinds: list[str]) -> dict[str, Any]:
-    """Facts of one file of ``measure``: its best PoseLib, and its rows by kind and solver."""
+    """Facts of one file of ``measure``: the best other library, and its rows by kind and solver."""
     found = totals(results)
     shares = ["all", *dict.fromkeys(row["group"] for row in results["rows"] if row["group"].endswith(" %"))]
     tables = {kind: find_rows(results, kind) for kind in kinds}
     more = {"groups": shares, "tables": tables, "total": found[ANY]["all"].number}
-    return {"name": name, "results": results, "totals": found, "peer": best_peer(found), **more}
+    return {"name": name, "results": results, "totals": found, "peer": by_success(found)[0], **more}
