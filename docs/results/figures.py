@@ -473,7 +473,7 @@ def plot_reliability(path: str | Path, curves: Mapping[str, Mapping[str, Sequenc
 
 # A solver with more inputs keeps its colour and has another marker and line.
 _RAW_LOOKS = {"+ratio": {"marker": "s", "linestyle": "--", "markerfacecolor": "white"}, "=fixed": {"marker": "^"}}
-_RAW_LOOKS |= {"min_iterations=100,": {"linestyle": ":"}}
+_RAW_LOOKS |= {"max_iterations=10000,": {"linestyle": ":"}}
 
 
 def grouped(rows: Iterable[Mapping[str, Any]], *keys: str) -> dict[Any, list[Mapping[str, Any]]]:
@@ -505,7 +505,7 @@ def plot_real_matches(
     looks = solver_styles(solvers)
     for name, style in looks.items():
         for part, look in _RAW_LOOKS.items():
-            style |= look if part in name else {}
+            style |= look if part in f"{name}," else {}
     styles = {titles[solver]: looks[solver] for solver in solvers}
     figure = make_figure(WIDTH, 3.6, "Nearest-neighbour matches without a ratio test")
     plots = ("success", " %", "outliers (%)"), ("ms", " %", "outliers (%)"), ("ms", " pairs", "pairs")
