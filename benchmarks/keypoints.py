@@ -122,7 +122,7 @@ def measure(path: Path) -> dict[str, Any]:
         less = {b: {k: interval(sums((v - scores[b][k]).numpy()), sizes) for k, v in one.items()} for b in BASES}
         rows.append({"way": name, **row, "less": less})
     inliers = (reprojection(new) < inlier_px)[new["mask"]].double()
-    counts = {"seen": len(seen["t"]), "measured": len(new["t"]), "clusters": len(new["cluster"].unique())}
+    counts = {"seen": len(seen["t"]), "measured": len(new["t"]), "clusters": len(sizes)}
     share = {"pairs": len(inliers) / len(new["t"]), "inliers": float(inliers.mean())}
     return {"source": path.stem, **counts, **share, "fitted": chosen, "rows": rows}
 

@@ -130,12 +130,11 @@ def pose_covariance(
     framed_pose, posed = frame.start(inputs.init)
     pose = sound_pose(inputs.init, posed)
     size_of_camera = 0 if focal == "known" else 1
-    state = State(framed_pose, problem.weights.new_zeros(problem.weights.shape[0], size_of_camera))
+    count = problem.weights.shape[0]
+    state = State(framed_pose, problem.weights.new_zeros(count, size_of_camera))
     projection = project(state, problem)
     if size_of_camera and (dist is not None or fisheye is not None):
-        lens = map_tensors(
-            lambda x: x.double().expand(*size, -1).reshape(math.prod(size), x.shape[-1]), (dist, fisheye)
-        )
+        lens = map_tensors(lambda x: x.double().expand(*size, -1).reshape(count, x.shape[-1]), (dist, fisheye))
         added = zoomed(projection.plane.permute(2, 1, 0), *lens).permute(2, 1, 0) - projection.plane
         projection = projection._replace(lens=added * (projection.rotated[2] + framed_pose.translation[:, 2]))
     total = problem.weights.sum(-1, keepdim=True)
@@ -174,7 +173,7 @@ def pose_covariance(
     if size_of_camera:  # the depth of the centroid grows with the focal length, see `refine.residual.moved`
         depth = pose.translation[:, 2] + rotated_centroid[:, 2]
         shift = torch.cat((shift, depth[:, None, None] * eye[2:3, :3].mT), -1)
-    first, last = (eye[rows].expand(matrix.shape[0], -1, -1) for rows in (slice(3), slice(6, None)))
+    first, last = (eye[rows].expand(count, -1, -1) for rows in (slice(3), slice(6, None)))
     back = torch.cat((first, shift, last), 1)
     covariance = back @ torch.where(determined, inverse, 0.0) @ back.mT
     covariance = torch.where(determined, covariance, eye.masked_fill(eye > 0, torch.inf))

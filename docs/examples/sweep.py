@@ -26,9 +26,8 @@ def main() -> None:
     fixed = [f"hydra.sweep.dir={folder}", f"train.updates={options.updates}", "resume=true", "progress=false"]
     subprocess.run([sys.executable, str(TRAIN), "-m", *fixed, *overrides], check=True)
 
-    table = pd.read_csv(
-        folder / "summary.csv", keep_default_na=False, na_values=[""]
-    )  # overrides, then "update", speed, and the success on each set
+    # The columns are the overrides, then "update", speed, and the success on each set. An override may be "null".
+    table = pd.read_csv(folder / "summary.csv", keep_default_na=False, na_values=[""])
     names = [override.lstrip("+").partition("=")[0] for override in overrides]
     rate, low, high = (f"{options.data}/{key}" for key in ("rate", "low", "high"))
     table = table[table["train.updates"] == options.updates].dropna(subset=names).sort_values(rate, ascending=False)
