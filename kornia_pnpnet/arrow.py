@@ -34,7 +34,7 @@ INPUTS = tuple(_SHAPES)
 OUTPUTS = ("rotation", "translation", "weights", "cost", "ok", "status")
 
 _LISTS = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
-_NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null
+_NUMBERS = pa.types.is_integer, pa.types.is_floating, pa.types.is_null, pa.types.is_boolean
 # Names of the values of `Status`. The last name is the status of rows that the solver cannot accept.
 _STATUS_NAMES = pa.array([*(status.name.lower() for status in Status), "malformed"])
 # Only problems with at least this number of pairs are padded. See `_groups`.
@@ -53,7 +53,7 @@ class Solve:
     (the name of a :class:`~kornia_pnpnet.result.Status` in lower case). If the solver estimates an unknown focal
     length, the result also has the columns ``intrinsics`` (9) and ``dist`` (4) with the estimates. Malformed rows have
     the identity and zeros there. Rows keep their order. Other columns of the table, for example ``id``, are kept.
-    Numbers are float32.
+    Tables with a float64 column of numbers are solved in float64, all others in float32. The result has that dtype.
 
     A row that cannot be solved raises no error: its ``ok`` is false, and its pose is finite. The status of a row is
     ``malformed`` if a list is missing or has an incorrect length, or if the solver does not accept the number of pairs.
@@ -108,17 +108,18 @@ class Solve:
         cells = {name: _Cells(name, table[name]) for name in INPUTS if name in table.column_names}
         counts = cells["world_points"].sizes // 3  # (rows,)
         fits = (counts >= 3) & np.logical_and.reduce([x.fit(counts) for x in cells.values()])
+        dtype = np.result_type(*(x.values for x in cells.values()))
         values: dict[str, np.ndarray] = {
-            "rotation": np.tile(np.eye(3, dtype=np.float32), (len(counts), 1, 1)),
-            "translation": np.zeros((len(counts), 3), dtype=np.float32),
-            "cost": np.full(len(counts), np.finfo(np.float32).max ** 0.5, dtype=np.float32),  # see `PnPNet.forward`
+            "rotation": np.tile(np.eye(3, dtype=dtype), (len(counts), 1, 1)),
+            "translation": np.zeros((len(counts), 3), dtype=dtype),
+            "cost": np.full(len(counts), np.finfo(dtype).max ** 0.5, dtype=dtype),  # see `PnPNet.forward`
             "ok": np.zeros(len(counts), dtype=bool),
             "status": np.full(len(counts), len(_STATUS_NAMES) - 1, dtype=np.int8),
         }
         if getattr(self.solver, "focal", "known") == "unknown":
-            values |= {"intrinsics": values["rotation"].copy(), "dist": np.zeros((len(counts), 4), dtype=np.float32)}
+            values |= {"intrinsics": values["rotation"].copy(), "dist": np.zeros((len(counts), 4), dtype=dtype)}
         ends = np.append(0, counts.cumsum())
-        weights = np.zeros(ends[-1], dtype=np.float32)
+        weights = np.zeros(ends[-1], dtype=dtype)
         pads = not trait(getattr(self.solver, "init", None), "fixed_pairs")
         for rows, width in _groups(counts, fits, self.pairs_at_once, pads=pads):
             there = np.arange(width) < counts[rows, None]  # (R, width), false for padding
@@ -163,7 +164,8 @@ class _Cells:
             array = compute.list_flatten(array)
         if not any(is_number(array.type) for is_number in _NUMBERS):
             raise TypeCheckError(f"the column {name} must hold lists of numbers, got {column.type}")
-        self.values = array.cast(pa.float32(), safe=False).to_numpy(zero_copy_only=False)
+        dtype = pa.float64() if pa.types.is_float64(array.type) else pa.float32()
+        self.values = array.cast(dtype, safe=False).to_numpy(zero_copy_only=False)
         self.starts, self.sizes = ends[:-1], np.where(nulls, 0, np.diff(ends))
         self.shape, self.one_for_all = _SHAPES[name], name.endswith("_sigma")
 

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from kornia_pnpnet.arguments import checked_inputs, restore_leading
 from kornia_pnpnet.cameras import pinholes, reproject
 from kornia_pnpnet.core.checks import check_form, check_positive, check_whole
+from kornia_pnpnet.core.configured import as_plain
 from kornia_pnpnet.core.extras import needs
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import MIN_PAIRS
@@ -71,6 +72,11 @@ class PeerSolver(nn.Module):
 
     def __post_init__(self) -> None:
         super().__init__()
+        for entry in fields(self):
+            value = as_plain(getattr(self, entry.name))
+            fits = type(entry.default) is not bool or type(value) is bool
+            KORNIA_CHECK(fits, f"{entry.name} must be true or false, got {value!r}.")
+            setattr(self, entry.name, value)
         check_positive(or_infinite=True, threshold=self.threshold)
         if hasattr(self, "source"):
             self.library()
@@ -191,8 +197,6 @@ class RobustPeer(PeerSolver):
         counts = {name: value for name, value in self.config().items() if name.endswith("iterations")}
         check_whole(0, seed=self.seed)
         check_whole(1, **counts)
-        for name, value in {**counts, "seed": self.seed}.items():
-            setattr(self, name, int(value))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -270,10 +274,6 @@ class OpenCVRansac(_OpenCV, RobustPeer):
     iterations: int = 1000
     method: str = "AP3P"
     refine: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        KORNIA_CHECK(type(self.refine) is bool, f"refine must be true or false, got {self.refine!r}.")
 
     def _solve(self, cv2: Any, world: np.ndarray, img: np.ndarray, intrinsics: np.ndarray) -> PeerPose | None:
         cv2.setRNGSeed(self.seed)

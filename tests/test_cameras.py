@@ -223,8 +223,7 @@ def test_bearings_in_every_direction(name, uniform):
     assert torch.equal(result.intrinsics, torch.eye(3, dtype=torch.float64).expand(32, 3, 3))
     if name != "epnp-lm":
         assert result.weights[:, :6].mean() < 0.05 * result.weights[:, 6:].mean()
-    in_pixels = create_solver(name)(points, rays, CAMERA, img_sigma=0.5)
-    assert right(in_pixels, pose, 0.05, 0.01).double().mean() > 0.9
+    assert right(create_solver(name)(points, rays, CAMERA, img_sigma=0.5), pose, 0.05, 0.01).double().mean() > 0.9
 
 
 def rig(batch, n, cameras, base, outlier_share=0.0):

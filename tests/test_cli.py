@@ -400,8 +400,7 @@ def test_solve_estimates_the_focal_length(csv_file):
 
 def test_solve_takes_cameras_of_colmap_and_with_skew_scale_and_y_up(csv_file, tmp_path):
     plain = answer(csv_file, "--intrinsics", CAMERA)
-    pinhole = answer(csv_file, "--camera", PINHOLE)
-    assert pinhole["translation"] == pytest.approx(plain["translation"], abs=1e-6)
+    assert answer(csv_file, "--camera", PINHOLE)["translation"] == pytest.approx(plain["translation"], abs=1e-6)
     radial = answer(csv_file, "--camera", "RADIAL,640,480,800,320,240,-0.05,0.01")
     assert radial["intrinsics"][0][0] == 800
     assert radial["translation"] != plain["translation"]

@@ -82,8 +82,7 @@ def test_lenses_bearings_and_rigs_have_the_covariance_of_a_pinhole_camera():
 @pytest.mark.parametrize(("n", "outliers"), [(12, 0), (20, 5)])
 def test_covariances_from_the_weights_of_the_shipped_network(n, outliers):
     """The mean normalised squared errors are those of chi-square: 6 for the pose, 3 for each half."""
-    data = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=outliers), dtype=DOUBLE)
-    p = data.batch(0)
+    p = SyntheticProblems(n=n, batch_size=2000, seed=9, outliers=OutlierMix(count=outliers), dtype=DOUBLE).batch(0)
     noise = {"img_sigma": 1.0, "world_sigma": 0.05}
     result = create_solver("pnpnet-set").double()(*p[:3], **noise)
     covariance = pose_covariance(result.pose, *p[:3], **noise, weights=result.weights)

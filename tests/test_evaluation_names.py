@@ -71,7 +71,7 @@ def scenes(monkeypatch):
 
 
 def draw(*sources, outliers="none", n=9, count=20, **options):
-    return problem_sets.evaluation_sets(sources, outliers, n=n, count=count, seed=3, **options)
+    return problem_sets.evaluation_sets(map(Path, sources), outliers, n=n, count=count, seed=3, **options)
 
 
 def test_synthetic_sets_are_the_protocols():
@@ -134,8 +134,7 @@ def test_scenes_are_the_protocols_and_of_one_name_are_named_by_their_paths(scene
     assert (entry.max_translation, entry.unit) == (0.2, "m")
     (arbitrary,) = draw("here/room", metric=False).values()
     assert (arbitrary.max_translation, arbitrary.unit) == (0.005 * scene().median_depth, "")
-    sets = draw("a/room", "b/room", "a/room")
-    assert list(sets) == ["room, n = 9, 0 outliers", "b/room, n = 9, 0 outliers"]
+    assert list(draw("a/room", "b/room", "a/room")) == ["room, n = 9, 0 outliers", "b/room, n = 9, 0 outliers"]
     with pytest.raises(BaseError, match="same name"):
         draw("a/room", "room")
 

@@ -46,8 +46,7 @@ def near(found, solver, inputs):
 
 
 def run_onnx(path, inputs):
-    runtime = pytest.importorskip("onnxruntime")
-    session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    session = pytest.importorskip("onnxruntime").InferenceSession(path, providers=["CPUExecutionProvider"])
     assert tuple(x.name for x in session.get_inputs()) == RIG_INPUTS[: len(inputs)]
     assert tuple(x.name for x in session.get_outputs())[:5] == OUTPUTS
     return session.run(None, {name: x.numpy() for name, x in zip(RIG_INPUTS, inputs, strict=False)})

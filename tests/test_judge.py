@@ -287,8 +287,7 @@ def test_the_solutions_of_three_pairs(make_problems):
     for pose, there in zip(*answers(result), strict=True):
         for i in range(4):
             errors = pose_errors(Pose(every.rotation[:, i], every.translation[:, i]), pose)
-            close = success(errors, 3.0, 0.05 * pose.translation.norm(dim=-1))
-            seen[:, i] |= there & close
+            seen[:, i] |= there & success(errors, 3.0, 0.05 * pose.translation.norm(dim=-1))
     assert (seen | ~valid).double().mean() > 0.95
 
 

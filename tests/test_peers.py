@@ -30,7 +30,7 @@ PAIRS += [("kornia-rs", *({"seed": x, **FOUR} for x in (0, 1)))]
 PAIRS += [("kornia-rs", *({"method": x, **FOUR} for x in ("AP3P", "EPnP")))]
 PAIRS += [("poselib", *({"progressive_sampling": x, **FEW} for x in (False, True)))]
 PAIRS += [("pycolmap", {"loss_scale": 0.1}, {"loss_scale": 100.0})]
-PAIRS += [(name, {"threshold": 3.0}, {"threshold": 100.0}) for name in ROBUST]
+PAIRS += [(name, {"threshold": 3.0}, {"threshold": np.int64(100)}) for name in ROBUST]
 
 
 def make(name: str, **options) -> PeerSolver:
@@ -144,11 +144,12 @@ def test_without_the_library_the_error_names_the_extra(peer, monkeypatch):
 
 @pytest.mark.parametrize("name", PEERS)
 def test_config_rebuilds_the_solver(name):
-    changed = {"method": "ITERATIVE"} if name in OPENCV else {"threshold": 7.0, "seed": 5}
+    changed = {"method": "ITERATIVE"} if name in OPENCV else {"threshold": np.int64(7), "seed": 5}
     solver = make(name, **changed)
     config = solver.config()
     assert changed.items() <= config.items()
     assert type(solver)(**config).config() == config
+    assert {type(x) for x in config.values()} <= {int, float, str, bool}
 
 
 class _Other(PeerSolver):

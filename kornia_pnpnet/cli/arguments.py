@@ -124,7 +124,9 @@ ARGUMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "--batch": _flag("every FILE is a shard (a file of many problems) or a folder of shards"),
         "--out": _arg("where --batch writes poses; default: outputs/poses", "FOLDER"),
         "--batch-size": _arg("problems per call", "B", type=_whole(1), default=10_000),
-        "--overwrite": _flag("replace the picture; with --batch also solve the shards that have results"),
+        "--overwrite": _flag(
+            "replace the picture; with --batch first delete the results of all shards, then solve all"
+        ),
     },
     "evaluate": {
         "--solver": _arg(_SOLVERS, "NAME", nargs="+", action="extend"),

@@ -21,10 +21,15 @@ class Configured(nn.Module):
         self.config: dict[str, Any] = {}
         for name, value in arguments.items():
             if name not in ("self", "__class__") and not isinstance(value, nn.Module):
-                if isinstance(value, Real) and not isinstance(value, bool):  # JSON has no NumPy numbers
-                    value = int(value) if isinstance(value, Integral) else float(value)
-                self.config[name] = value
+                self.config[name] = as_plain(value)
 
     def extra_repr(self) -> str:
         """Show the arguments of the constructor."""
         return ", ".join(f"{name}={value!r}" for name, value in self.config.items())
+
+
+def as_plain(value: Any) -> Any:
+    """Convert a NumPy number to Python's, because neither JSON nor OpenCV accepts it. Other values do not change."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return value
+    return int(value) if isinstance(value, Integral) else float(value)

@@ -68,7 +68,7 @@ def load_scene(path: str | Path, *, metric: bool = True, min_points: int = 10, m
 
 
 def undistort(camera: str, img_points: Tensor) -> tuple[Tensor, Tensor]:
-    """Undistort pixels of any camera model that ``pycolmap`` knows.
+    """Undistort pixels of any perspective camera model that ``pycolmap`` knows.
 
     Args:
         camera: ``MODEL,width,height,params...``, as in COLMAP's ``cameras.txt`` but without the camera's ID.

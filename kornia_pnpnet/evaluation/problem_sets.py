@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -56,7 +57,7 @@ def _read_outliers(text: str, n: int, mismatches_only: bool) -> Iterator[tuple[s
 
 
 def evaluation_sets(
-    sources: Iterable[str],
+    sources: Iterable[str | Path],
     outliers: str,
     *,
     n: int | Iterable[int],
@@ -90,13 +91,13 @@ def evaluation_sets(
         FileNotFoundError: when a source does not exist.
         ImportError: when a source needs a package that is not installed.
     """
-    sizes = [n] if isinstance(n, int) else list(n)
+    sizes = list(n) if isinstance(n, Iterable) else [n]
     if min(sizes) < 3:
         raise ValueCheckError(f"--n: a pose needs at least 3 pairs, got {min(sizes)}")
     mixes = [(size, *mix) for size in sizes for mix in _read_outliers(outliers, size, mismatches_only)]
     noise = {"known_noise": 1.0} if known_noise else {}
     sets: dict[str, EvaluationData] = {}
-    for source in dict.fromkeys(sources):
+    for source in dict.fromkeys(map(str, sources)):
         try:
             scene = None if source in PRIORS else load_scene(source, metric=metric)
             name = source if scene is None else scene.name

@@ -208,7 +208,7 @@ class RobustWeightedLM(Configured):
         KORNIA_CHECK(kernel in KERNELS, f"kernel must be one of {sorted(KERNELS)}, got {kernel!r}.")
         KORNIA_CHECK(update in ("retraction", "additive"), f"update must be retraction or additive, got {update!r}.")
         self.backward = backward
-        self.m = m
+        self.m = m = int(m)
         self.explored = 7 * m // 10
         self.by_residual = min(by_residual, m - self.explored)
         self.additive = update == "additive"
@@ -258,7 +258,7 @@ class RobustWeightedLM(Configured):
             for name, parameter in refine.named_parameters():
                 trained = self.get_parameter(name).detach()
                 parameter.data = trained[torch.arange(len(parameter)).clamp(max=len(trained) - 1)]
-                parameter.requires_grad = m > 0 and (self.m == 0 or self.get_parameter(name).requires_grad)
+                parameter.requires_grad = refine.m > 0 and (self.m == 0 or self.get_parameter(name).requires_grad)
         return refine
 
     def forward(self, problem: Problem, starts: Starts) -> Refinement:
