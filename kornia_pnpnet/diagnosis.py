@@ -44,7 +44,7 @@ class Diagnosis(NamedTuple):
 
     def __str__(self) -> str:
         def text(trial: Trial, of: str = "") -> str:
-            return f"{100.0 * trial.agree:.0f} %{of} to {float(f'{trial.sigma:.2g}'):g} px"  # no exponent
+            return f"{100.0 * trial.agree:.0f} %{of} to {float(f'{abs(trial.sigma):.2g}'):g} px"  # no exponent
 
         given = self.trials[0]
         before = f"{given.change}: {text(given)}"

@@ -284,6 +284,8 @@ class PackagedSolver:
             ShapeError: when a shape differs from the shapes for which the package was compiled.
             ValueCheckError: when a package for rigs gets no ``cam_from_rig``, or any other package gets one.
         """
+        intrinsics = camera_matrices(intrinsics)
+        check_tensors({"world_points": world_points, "img_points": img_points, "intrinsics": intrinsics})
         if self.rig != (cam_from_rig is not None):
             raise ValueCheckError(f"This package {'needs' if self.rig else 'does not take'} cam_from_rig.")
         batch, given = (*world_points.shape, 0, 0)[:2]
@@ -292,8 +294,6 @@ class PackagedSolver:
         batch, n = self.batch or batch, max(given, MIN_PAIRS if self.sizes else 4) if any_number else size
         weights = world_points.new_ones(batch, n) if weights is None else weights
         cameras = (batch, n, 3, 3) if self.rig else (batch, 3, 3)
-        intrinsics = camera_matrices(intrinsics)
-        check_tensors({"intrinsics": intrinsics})
         intrinsics = intrinsics.expand(cameras) if intrinsics.ndim == 2 else intrinsics
         shapes = (batch, n, 3), (batch, n, 2), cameras, (batch, n), (batch, n, 3, 3), (batch, n, 3)
         inputs = [world_points, img_points, intrinsics, weights, *(cam_from_rig or ())]

@@ -82,7 +82,7 @@ def _centre(problems: Problems) -> Tensor:
     check_tensors(tensors)
     check_shapes({"img_points": (problems.img_points, (*problems.world_points.shape[:-1], 2))}, problems.world_points)
     check_like(tensors, problems.pose.translation, "the translation of the truth")
-    return problems.world_points.mean(-2)
+    return problems.world_points.nan_to_num(0.0, 0.0, 0.0).mean(-2)  # a bad problem must not spoil the batch
 
 
 @dataclass(eq=False, repr=False, kw_only=True)

@@ -30,6 +30,8 @@ __all__ = ["depth_points", "heatmap_keypoints"]
 
 # Variance per axis of a uniform distribution over one cell, in squared cells.
 _CELL_VARIANCE = 1.0 / 12.0
+# Least logit of a heatmap. With logits of minus infinity, the gradient of the temperature would be NaN.
+_LEAST_LOGIT = -1e30
 
 
 @full_precision
@@ -83,7 +85,7 @@ def heatmap_keypoints(
         KORNIA_CHECK(fits, f"temperature must broadcast to the shape of heatmaps, got {shapes}.")
     else:
         check_positive(temperature=temperature)
-    logits = heatmaps.to(common_dtype(tensors)) / temperature
+    logits = heatmaps.to(common_dtype(tensors)).clamp(min=_LEAST_LOGIT) / temperature
     check_shapes({"heatmaps / temperature": (logits, tuple(heatmaps.shape))})
     *size, height, width = heatmaps.shape
     share = spatial_softmax2d(logits.reshape(math.prod(heatmaps.shape[:-3]), *heatmaps.shape[-3:]))

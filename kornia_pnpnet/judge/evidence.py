@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_pnpnet.core.linalg import solve_symmetric
+from kornia_pnpnet.core.performance import in_cache
 from kornia_pnpnet.core.symmetric import Symmetric2
 from kornia_pnpnet.core.trees import map_tensors
 from kornia_pnpnet.problem import LEAST_NOISE, MIN_PAIRS, Problem, State
@@ -240,17 +241,23 @@ def evidence(seen: AtPose, problem: Problem, votes: Votes) -> Evidence:
     power = torch.arange(_SCALES, dtype=radian.dtype, device=radian.device)[:, None, None]
     factors = torch.where(votes.known, 1.0, _LEAST_ANGLE**2 * radian) * _STEP**power  # (F, B, 1)
     log_prior = torch.where(votes.known, _UNEXPECTED * power, -math.log(_SCALES))
-    share = factors.new_full((), 0.5)
-    inlier, _, outlier = Mixture(factors, share, factors, total).densities(exponent, outliers)  # (F, B, N)
-    chances, more = votes.pairs / total * inlier, inlier - outlier
-    for _ in range(_ROUNDS):
-        share = share * (chances / torch.addcmul(outlier, share, more)).sum(-1, keepdim=True)
-        share = share.clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
-    terms = votes.pairs * (torch.addcmul(outlier, share, more) / outlier).log()
-    # Three points fit any pose. If they were detected repeatedly, all of their pairs do.
-    by_point = torch.zeros_like(terms).scatter_add(-1, votes.points.expand_as(terms), terms)
-    fitted = by_point.topk(MIN_PAIRS, -1).values.clamp(min=0.0).sum(-1, keepdim=True)
-    likelihood = terms.sum(-1, keepdim=True) - fitted + log_prior  # (F, B, 1)
+
+    def fitted(factors: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-likelihoods and shares of inliers at given variances (F, B, 1)."""
+        share = factors.new_full((), 0.5)
+        inlier, _, outlier = Mixture(factors, share, factors, total).densities(exponent, outliers)  # (F, B, N)
+        chances, more = votes.pairs / total * inlier, inlier - outlier
+        for _ in range(_ROUNDS):
+            share = share * (chances / torch.addcmul(outlier, share, more)).sum(-1, keepdim=True)
+            share = share.clamp(_LEAST_SHARE, 1.0 - _LEAST_SHARE)
+        terms = votes.pairs * (torch.addcmul(outlier, share, more) / outlier).log()
+        # Three points fit any pose. If they were detected repeatedly, all of their pairs do.
+        by_point = torch.zeros_like(terms).scatter_add(-1, votes.points.expand_as(terms), terms)
+        most = by_point.topk(MIN_PAIRS, -1).values.clamp(min=0.0).sum(-1, keepdim=True)
+        return terms.sum(-1, keepdim=True) - most, share
+
+    likelihood, share = in_cache(fitted, (factors,), exponent.numel())
+    likelihood = likelihood + log_prior  # (F, B, 1)
     last = total[:, 0].clamp(min=MIN_PAIRS) - 1.0
     samples = last**3 - last  # six times the number of triples
     log_ratio = likelihood.logsumexp(0)[:, 0] - (_POSES / 6.0 * samples).log()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import torch
 from kornia.core.check import KORNIA_CHECK
@@ -12,7 +12,15 @@ from torch.nn import functional
 
 from kornia_pnpnet.core.checks import check_devices, check_whole
 from kornia_pnpnet.core.linalg import align, solve_symmetric
-from kornia_pnpnet.core.performance import are_few, compiling, present_first, problems_last, sees_values, take_pairs
+from kornia_pnpnet.core.performance import (
+    are_few,
+    compiling,
+    in_cache,
+    present_first,
+    problems_last,
+    sees_values,
+    take_pairs,
+)
 from kornia_pnpnet.core.trees import pairs_at
 from kornia_pnpnet.judge.evidence import groups, totals
 from kornia_pnpnet.problem import LEAST_DEPTH, Noise, Problem, Starts, State
@@ -188,7 +196,7 @@ def _sample_table(count: int, number: int, search_follows: bool, device: torch.d
         return torch.tensor(ranks, device=device), torch.tensor(least, device=device)[:, None]
 
 
-def _support(poses: Tensor, judges: Tensor) -> Tensor:
+def _support(judges: Tensor, poses: Tensor) -> Tensor:
     """Scores (H, B) that the pairs ``judges`` (7, K, B) give to poses [R | t] (3, 4, H, B)."""
     a, b, c, u, v, vote, precision = judges.unbind()  # (K, B) each
     first, second, third, translation = poses[:, :, :, None].unbind(1)  # (3, H, 1, B) each
@@ -347,7 +355,9 @@ class SetInit(Initialiser):
             index = order.gather(1, spread_evenly(usual.gather(1, order), _ENOUGH))
             problem, same = pairs_at((problem, same), index)
         view = _View(problem, self.confidence, same)
-        of_pairs, of_problem = (x.to(view.there.dtype) for x in self._run(view))
+        numbers = view.there.shape[1] * self.config["hidden"]
+        outputs = in_cache(self._run, (view.features, view.there), numbers, join=-2)
+        of_pairs, of_problem = (x.to(view.there.dtype) for x in outputs)
         probability = torch.sigmoid(of_pairs[0])
         counts, along = of_pairs[1:].split(starts)  # (S, B, N) each
         away, noise = of_problem.split((starts, 2), -1)
@@ -414,7 +424,7 @@ class SetInit(Initialiser):
         if search_follows:
             entries = torch.cat((entries, torch.stack([as_entries(pose).mT for pose in others], 1)), 1)
             valid = torch.cat((valid, valid.new_ones(len(others), batch)))
-        support = _support(entries.unflatten(0, (3, 4)), pairs)
+        support = in_cache(partial(_support, pairs), (entries.unflatten(0, (3, 4)),), 3 * pairs[0].numel(), split=2)
         valid = valid & (support > 0)
         for term in problem.pose_terms:
             support = support - term.disagreement(as_pose(entries.permute(1, 2, 0)))
@@ -422,10 +432,10 @@ class SetInit(Initialiser):
         chosen = entries.gather(1, best.expand(12, 1, -1))[:, 0].mT  # (B, 12)
         return as_pose(torch.where((score > -torch.inf)[:, None], chosen, as_entries(others[0])))
 
-    def _run(self, view: _View) -> tuple[Tensor, Tensor]:
-        """The network's outputs per pair (1 + 2 S, B, N) and per problem (B, S + 2), for S ``starts``."""
-        x = self.first(view.features.flatten(0, 1).to(self.first.weight.dtype))
-        absent = torch.where(view.there > 0, x.new_zeros(()), max(_ABSENT, 0.5 * torch.finfo(x.dtype).min)).contiguous()
+    def _run(self, features: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+        """The network's outputs per pair (1 + 2 S, B, N) and per problem (B, S + 2), for S ``starts``. See `_View`."""
+        x = self.first(features.flatten(0, 1).to(self.first.weight.dtype))
+        absent = torch.where(there > 0, x.new_zeros(()), max(_ABSENT, 0.5 * torch.finfo(x.dtype).min)).contiguous()
         for block in self.blocks:
             x = block(x, absent)
         x = self.norm(x)
