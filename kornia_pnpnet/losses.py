@@ -218,12 +218,14 @@ class SetLoss(nn.Module):
 
 def _negative_log_likelihood(noise: Noise, problems: Problems) -> Tensor:
     """Mean negative log-likelihood of the inliers' residuals at the true pose, up to a constant, (B,)."""
-    cam = problems.true_cam_points
-    cam = torch.where(problems.inliers[..., None], cam, torch.eye(3, dtype=cam.dtype, device=cam.device)[2])
+    cam, img = problems.true_cam_points, problems.img_points
+    used = problems.inliers & (cam.sum(-1) + img.sum(-1)).isfinite()
+    cam = torch.where(used[..., None], cam, torch.eye(3, dtype=cam.dtype, device=cam.device)[2])
+    img = torch.where(used[..., None], img, 0.0)
     cameras = problems.pair_intrinsics / problems.pair_intrinsics[..., 2:, 2:]
     seen = (cameras @ cam[..., None])[..., 0]  # Kornia's `project_points` ignores skew
-    sq_residual = (convert_points_from_homogeneous(seen, eps=0.0) - problems.img_points).square().sum(-1)
+    sq_residual = (convert_points_from_homogeneous(seen, eps=0.0) - img).square().sum(-1)
     moved = cameras.diagonal(dim1=-2, dim2=-1)[..., :2].abs().mean(-1) * noise.world / cam[..., 2]
     variance = noise.img.square() + moved.square() * (1.0 + 0.5 * (cam[..., :2] / cam[..., 2:]).square().sum(-1))
     loss = variance.log() + 0.5 * (sq_residual / variance).clamp(max=_MOST_VARIANCES)
-    return torch.where(problems.inliers, loss, 0.0).sum(-1) / problems.inliers.sum(-1).clamp(min=1)
+    return torch.where(used, loss, 0.0).sum(-1) / used.sum(-1).clamp(min=1)

@@ -186,8 +186,7 @@ def test_nothing_reads_a_value_back(name):
 def test_inductor_computes_the_same(whole):
     """With buffers in place, the compiler of PyTorch 2.13 gave wrong gradients by the world points."""
     torch.compiler.reset()
-    effort = "fixed" if whole else None
-    solver = create_solver("pnpnet-n6", m=3, views=2, effort=effort).double().requires_grad_()
+    solver = create_solver("pnpnet-n6", m=3, views=2, effort="fixed" if whole else None).double().requires_grad_()
     compiled = copy.deepcopy(solver)
     compiled.compile(whole=whole)
     for count in (50, 31, 1):

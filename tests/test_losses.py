@@ -202,6 +202,7 @@ def test_losses_of_bad_problems_are_finite():
     leaves = [x.requires_grad_() for x in pytree.tree_leaves(call)]
     result, starts = create_solver("pnpnet-set").double().with_starts(**call)
     p = SyntheticProblems(n=PAIRS, batch_size=len(result.ok), dtype=torch.float64).batch(0)
+    p.world_points[~result.ok] = torch.nan
     for terms in (SetLoss()(result, p, 1.0, starts), PoseLoss()(result, p)):
         finite(terms, torch.autograd.grad(terms.total, leaves, retain_graph=True, materialize_grads=True))
 

@@ -203,8 +203,7 @@ def test_a_singular_system_in_its_range_has_a_finite_solution():
     matrix[:2, :2] = 1.0
     rhs = torch.tensor([2.0, 2.0, 0.0], dtype=torch.float64)[:, None]
     (solution,) = solve_leading(matrix, rhs, (3,))
-    reached = (matrix[..., 0] @ torch.stack(solution)[:, 0])[:, None]
-    torch.testing.assert_close(reached, rhs)
+    torch.testing.assert_close((matrix[..., 0] @ torch.stack(solution)[:, 0])[:, None], rhs)
     assert torch.stack(solution).isfinite().all()
 
 

@@ -282,3 +282,10 @@ def test_radial_distortion_is_a_minimum_as_accurate_as_the_noise_allows():
     of_step, of_error = ((x * (information @ x[..., None])[..., 0]).sum(-1)[result.ok] for x in (step, error))
     assert of_step.max() < 0.01  # the prior of the coefficient
     assert of_error.mean().item() == pytest.approx(8.0, rel=0.1)
+
+
+def test_parts_that_fit_a_cache_change_no_result(make_problems, monkeypatch):
+    p, solver = make_problems(20, 70, outliers=5), create_solver("pnpnet-set")
+    expected = solver(*p[:3])
+    monkeypatch.setattr("kornia_pnpnet.core.performance._CACHE_BYTES", 1000)
+    assert_same(solver(*p[:3]), expected, 1e-6, 1e-6)

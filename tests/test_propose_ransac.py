@@ -360,8 +360,7 @@ def test_weights_decide_between_two_poses(make_problems):
 
 def test_sound_problems_are_ok_and_pixels_of_no_pose_are_not(make_problems):
     for n, outliers in ((6, 0), (9, 3), (40, 28)):
-        problems = make_problems(n, 100, outliers=outliers)
-        assert solver(**PROTOCOL)(*problems[:3]).ok.double().mean() > 0.97
+        assert solver(**PROTOCOL)(*make_problems(n, 100, outliers=outliers)[:3]).ok.double().mean() > 0.97
     for n, options in itertools.product((4, 5, 9, 40), (PROTOCOL, {"threshold": 4.0})):
         mix = OutlierMix(count=n, mismatch_share=0.0)
         problems = SyntheticProblems(n=n, batch_size=100, outliers=mix, dtype=torch.float64).batch(0)
@@ -383,8 +382,7 @@ def test_the_gradient_is_that_of_the_result(make_problems, generator):
         (guess.pose.translation * probe).sum().backward()
         ends = [ransac(corr._replace(**{name: value + s * direction})).pose.translation for s in (step, -step)]
         numeric = ((ends[0] - ends[1]) * probe).sum(-1) / (2 * step)
-        analytic = (leaf.grad * direction).flatten(1).sum(-1)
-        torch.testing.assert_close(analytic, numeric, rtol=5e-2, atol=1e-8)
+        torch.testing.assert_close((leaf.grad * direction).flatten(1).sum(-1), numeric, rtol=5e-2, atol=1e-8)
 
 
 def test_rivals_are_more_accurate_if_the_noise_exceeds_the_threshold():

@@ -122,8 +122,7 @@ def test_a_stopped_run_goes_on_where_it_was(start, tmp_path):
     for path in (tmp_path / "calls").iterdir():
         path.unlink()
     assert start("id").wait(DEADLINE) == 0
-    rows = sum(int(path.read_text()) for path in (tmp_path / "calls").iterdir())
-    assert 0 < rows < FILES * ROWS
+    assert 0 < sum(int(path.read_text()) for path in (tmp_path / "calls").iterdir()) < FILES * ROWS
     check_results(tmp_path)
     before = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert start("id").wait(DEADLINE) == 0  # nothing is left to do

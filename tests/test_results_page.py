@@ -36,8 +36,7 @@ def results():
 @pytest.mark.parametrize("plot", [plots.plot_success, plots.plot_errors])
 def test_a_file_is_written_and_global_state_stays(tmp_path, results, plot):
     before = dict(mpl.rcParams)
-    path = plot(tmp_path / "new" / "a.png", results)
-    assert path.read_bytes().startswith(b"\x89PNG")
+    assert plot(tmp_path / "new" / "a.png", results).read_bytes().startswith(b"\x89PNG")
     assert dict(mpl.rcParams) == before
     assert not pyplot.get_fignums()
     with pytest.raises(ValueError, match="no rows"):

@@ -249,8 +249,7 @@ def test_a_given_matrix_becomes_the_nearest_rotation(make_problems, generator):
 def test_a_given_matrix_that_is_no_rotation_is_ignored(factor, make_problems):
     p = make_problems()
     given = Pose(factor * p.pose.rotation, p.pose.translation)
-    result = create_solver("epnp-lm")(*p[:3], init=given)
-    assert_same(result.pose, create_solver("epnp-lm")(*p[:3]).pose, 1e-6, 1e-6)
+    assert_same(*(create_solver("epnp-lm")(*p[:3], init=x).pose for x in (given, None)), 1e-6, 1e-6)
     assert (create_solver("identity-lm", m=0)(*p[:3], init=given).status == Status.INIT).all()
 
 
@@ -361,8 +360,7 @@ def _solve_each(solver, problems, places):
 @pytest.mark.parametrize("name", ["pnpnet-set", "pnpnet-n9", "epnp-lm", "identity-lm"])
 def test_a_data_loader_returns_results_and_loaded_weights_can_be_trained(name):
     solve = partial(_solve_each, create_solver(name), SyntheticProblems(n=9, batch_size=4, seed=0).batch(0))
-    result = next(iter(DataLoader(range(4), batch_size=4, num_workers=1, collate_fn=solve)))
-    assert result.rotation.shape == (4, 3, 3)
+    assert next(iter(DataLoader(range(4), batch_size=4, num_workers=1, collate_fn=solve))).rotation.shape == (4, 3, 3)
     if name in k.shipped_weights():
         assert all(x.requires_grad for x in PnPNet.from_pretrained(name).parameters())
 

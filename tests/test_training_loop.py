@@ -187,8 +187,7 @@ def test_train_briefly(tmp_path):
         with pytest.raises(BaseError, match="seconds"):
             train_briefly(seconds, tmp_path, progress=False)
     assert old.read_bytes() == b"old"
-    curves = train_briefly(1.0, tmp_path, progress=False)
-    assert curves == tmp_path / HISTORY_NAME
+    assert train_briefly(1.0, tmp_path, progress=False) == tmp_path / HISTORY_NAME
     rows = read_history(tmp_path)
     assert len(rows) >= 10
     assert float(rows[-1]["val/none/success"]) > float(rows[0]["val/none/success"])
