@@ -123,7 +123,7 @@ class Solve:
         pads = not trait(getattr(self.solver, "init", None), "fixed_pairs")
         for rows, width in _groups(counts, fits, self.pairs_at_once, pads=pads):
             there = np.arange(width) < counts[rows, None]  # (R, width), false for padding
-            taken = {name: torch.from_numpy(x.take(rows, width)) for name, x in cells.items()}
+            taken = {name: torch.from_numpy(x.take(rows, width).astype(dtype, copy=False)) for name, x in cells.items()}
             inputs: dict[str, Any] = {"intrinsics": self.intrinsics, **taken}
             with torch.no_grad(), suppress(ShapeError):  # raised if the solver does not accept `width` pairs
                 result = self.solver(**inputs, mask=None if there.all() else torch.from_numpy(there))

@@ -60,7 +60,8 @@ def pose_covariance(
     If :math:`(R, t)` is the true pose, the estimated pose is :math:`(\mathrm{cay}(\omega) R,\; t + v)` with the Cayley
     transform cay. :math:`\Sigma_i` is the covariance of the pixel, see
     :func:`~kornia_pnpnet.refine.residual.pixel_covariance`. The sums run in float64. Gradients flow to all arguments.
-    A lens also changes the noise, but this change counts as constant: ``dist`` and ``fisheye`` have no gradient here.
+    But the effect of a lens on the noise counts as constant. With a known focal length, ``dist`` and ``fisheye``
+    therefore have no gradient.
 
     A robust kernel gives most inliers a weight :math:`u_i` below 1. An M-estimate is nevertheless almost as accurate as
     least squares on the inliers (P. Huber, "Robust Statistics", 1981). The weights are therefore divided by their mean

@@ -76,13 +76,14 @@ def pose_distances(estimate: Pose, truth: Pose, origin: Tensor | None = None) ->
 
 
 def _centre(problems: Problems) -> Tensor:
-    """Centroids of the world points, (B, 3). The tensors of the problems must have one dtype and one device."""
+    """Centroids of the finite world points, (B, 3). The tensors of the problems must have one dtype and one device."""
     check_pose("The pose of the problems", problems.pose)
     tensors = {name: getattr(problems, name) for name in ("world_points", "img_points", "intrinsics")}
     check_tensors(tensors)
     check_shapes({"img_points": (problems.img_points, (*problems.world_points.shape[:-1], 2))}, problems.world_points)
     check_like(tensors, problems.pose.translation, "the translation of the truth")
-    return problems.world_points.nan_to_num(0.0, 0.0, 0.0).mean(-2)  # a bad problem must not spoil the batch
+    world, seen = problems.world_points, problems.world_points.isfinite().all(-1, keepdim=True)
+    return torch.where(seen, world, 0.0).sum(-2) / seen.sum(-2).clamp(min=1)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)

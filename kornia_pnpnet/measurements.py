@@ -57,6 +57,7 @@ def heatmap_keypoints(
 
     Returns:
         A solver's ``img_points`` (B, N, 2) and ``img_cov`` in px² (B, N, 2, 2). A map with NaN gives NaN.
+        A map of minus infinity alone counts as uniform.
 
     Raises:
         BaseError: when ``heatmaps`` is not a real tensor of maps with at least one cell, when ``temperature`` does not

@@ -64,10 +64,11 @@ def test_weights_sigmas_and_options_reach_the_solver(draw):
     weights, img_sigma = np.ones((7, 9), np.float32), np.linspace(0.5, 2.0, 63, dtype=np.float32).reshape(7, 9)
     weights[:, 7:] = 0.0
     world_sigma = np.full((7, 1), 0.05, np.float32)
-    problems, table = draw(weights=weights > 0, img_sigma=img_sigma, world_sigma=world_sigma)
+    problems, table = draw(weights=weights, img_sigma=img_sigma, world_sigma=world_sigma)
     tensors = {"weights": weights, "img_sigma": img_sigma, "world_sigma": world_sigma.repeat(9, 1)}
     expected = create_solver("pnpnet-set", m=3)(*problems[:3], **{k: torch.from_numpy(x) for k, x in tensors.items()})
     as_number = table.set_column(5, "world_sigma", pa.array(world_sigma[:, 0]))
+    as_number = as_number.set_column(3, "weights", pa.array((weights > 0).tolist()))
     for given in (table, as_number):
         found = Solve("pnpnet-set", m=np.int64(3))(given)
         np.testing.assert_array_equal(numbers(found, "translation"), expected.translation)

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import finite
+from helpers import assert_same, finite
 from kornia.core.exceptions import BaseError
 from laws import PAIRS, Case, make, make_bad
+from torch import nn
 from torch.utils import _pytree as pytree
 
 from kornia_pnpnet import Noise, PnPResult, Pose, PoseLoss, SetLoss, Starts, create_solver, pose_covariance
@@ -123,6 +124,8 @@ def test_the_first_translation_is_compared_at_the_centroid(make_problems, random
     terms = PoseLoss()(solved(p, Pose(turned, kept), p.pose), p)
     assert terms.init_translation < 1e-6
     assert terms.init_rotation > 0.1
+    padded = {x: nn.functional.pad(getattr(p, x), (0, 0, 0, 1), value=math.nan) for x in ("world_points", "img_points")}
+    assert_same(PoseLoss()(solved(p, Pose(turned, kept), p.pose), p._replace(**padded)), terms)
 
 
 def test_saturation_bounds_each_problem(make_problems):

@@ -152,7 +152,7 @@ REFUSED = [
     *((partial(SubsetSolver, EPnP()), {"size": 2}), (KnownInliersAndNoise, {"img_sigma": -1.0})),
     *((OpenCVUsac, {"method": method}) for method in ("USAC_FM_8PTS", "SOLVEPNP_EPNP")),
     (KorniaRs, {"threshold": math.inf, "max_iterations": 0, "method": "P3P"}),
-    *((OpenCVPnP, {"method": "NOPE"}), (PyColmap, {"loss_scale": 0.0, "max_iterations": 50})),
+    (PyColmap, {"loss_scale": 0.0, "max_iterations": 50}),
     (data.OutlierMix, {"max_ratio": 1.5, "count": -1, "min_count": -1, "mismatch_share": 2.0}),
     (data.OutlierMix, {"near_pixels": (3.0, 1.0), "structured_ratio": (0.0, 0.5), "crowd_share": 1.1, "max_crowds": 0}),
     (data.OutlierMix, {"structured_angle": -1.0, "mirrored_share": 1.5}),

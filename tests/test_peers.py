@@ -49,8 +49,7 @@ def test_clean_problems_are_solved_exactly(name, n, make_problems):
     exact = (errors.rotation_error_deg < 1e-3) & (errors.translation_error < 1e-3)
     assert result.ok.all()
     # Of four pairs OpenCV's EPnP finds the pose of every fifth problem, SQPnP and USAC miss few.
-    share = {"opencv-epnp": 0.1}.get(name, 0.9) if n == 4 else 1.0
-    assert exact.double().mean() >= share
+    assert exact.double().mean() >= ({"opencv-epnp": 0.1}.get(name, 0.9) if n == 4 else 1.0)
     assert (result.weights[exact] == 1).all()
     assert result.cost[exact].max() < 1e-4  # USAC computes in float32
 

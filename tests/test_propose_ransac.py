@@ -327,8 +327,7 @@ def test_exact_recovery_among_outliers(n, outliers, scorer, make_problems):
 
 
 def test_an_unknown_focal_length_changes_neither_priors_nor_samples(make_problems):
-    p = make_problems(7, 5, noise=False)
-    problem = Normalize(order=False)(*p[:3])[0].map(torch.Tensor.contiguous)
+    problem = Normalize(order=False)(*make_problems(7, 5, noise=False)[:3])[0].map(torch.Tensor.contiguous)
     one, two = torch.ones_like(problem.weights[:, 0]), 2.0 * problem.focal.expand(5)
     free = problem._replace(free_focal=CameraTerm(two, None, one, two))
     solver = SubsetSolver(EPnP(), RobustWeightedLM(3, learnable=False), size=7)
@@ -338,8 +337,7 @@ def test_an_unknown_focal_length_changes_neither_priors_nor_samples(make_problem
     term, _ = PoseTerm.of(prior, torch.zeros_like(problem.world_points[:, 0]), one)
     scene = Scene.of(free._replace(pose_terms=(term,)), Thresholds(one[:, None], 0.0 * one[:, None]), torch.float64)
     entries = as_entries(pose).mT * torch.tensor([1.0] * 8 + [2.0] * 4).double()[:, None]
-    losses = [x.losses(entries, SCORERS["msac"])[0] for x in (scene, scene._replace(terms=()))]
-    assert_close(*losses)
+    assert_close(*(x.losses(entries, SCORERS["msac"])[0] for x in (scene, scene._replace(terms=()))))
 
 
 def test_weights_decide_between_two_poses(make_problems):

@@ -1,7 +1,8 @@
 """Compare solvers on the same problems.
 
 The solvers run in one thread. Their results are printed as a table and written to a results file. The same command
-continues an interrupted evaluation. With --solver, more solvers, data, n or outliers add rows to the results file.
+continues an interrupted evaluation. If --solver names the solvers, a command with more of them, or with more data, n
+or outliers, adds rows to the results file.
 
   pnpnet evaluate --solver pnpnet-n9 opencv-ransac:threshold=12 --data path/to/colmap --outliers none,2
   pnpnet evaluate --n 6,9,20,50 --outliers none,uniform,30%

@@ -66,7 +66,7 @@ def solve_shards(
         name: name of the solver. Results files store this name, a digest of weights, options and intrinsics, and a
             digest of the shard, which is read once more for it.
         batch: largest number of problems that are solved at once. Parquet shards are also read in such parts.
-        overwrite: also solve the shards that have results.
+        overwrite: first delete the results of all shards, then solve all shards.
 
     Raises:
         InputError: when there is no shard, when two shards would have results of the same name, when ``out`` is the

@@ -138,15 +138,18 @@ def repeat_problems(tree: _T, count: int) -> _T:
 def in_cache(
     function: Callable[..., _T], tensors: Sequence[Tensor], numbers: int, *, split: int = 0, join: int = 0
 ) -> _T:
-    """Call a function on parts of tensors, so that its intermediate results stay in the cache of a CPU's core.
+    """Call a function on parts of tensors, so that its intermediate results stay in the caches of a CPU's cores.
 
     The tensors are split along the dimension ``split``, and the results are joined along the dimension ``join``.
     ``numbers`` is the size of the largest intermediate result for one index of ``split``. Compiled code and other
-    devices do not split. For 1000 problems of 20 pairs, the parts save a quarter of the time of ``pnpnet-set``.
+    devices do not split. For 1000 problems of 20 pairs, the parts save a quarter of the time of ``pnpnet-set``, or
+    a twentieth after :func:`keep_freed_memory`.
     """
     first = tensors[0]
-    size = max(1, _CACHE_BYTES // max(1, numbers * first.element_size()))
-    if compiling() or first.device.type != "cpu" or first.shape[split] <= size:
+    if compiling() or first.device.type != "cpu":
+        return function(*tensors)
+    size = max(1, _CACHE_BYTES * torch.get_num_threads() // max(1, numbers * first.element_size()))
+    if first.shape[split] <= size:
         return function(*tensors)
     parts = zip(*(x.split(size, split) for x in tensors), strict=True)
     return map_tensors(lambda *x: torch.cat(x, join), *(function(*part) for part in parts))
@@ -161,7 +164,7 @@ def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
 
-# Size of an intermediate result that stays in the cache of a core.
+# Size of an intermediate result that stays in the cache of one core.
 _CACHE_BYTES = 2**20
 
 # Largest mmap threshold of glibc (32 MiB, see M_MMAP_THRESHOLD in mallopt(3)) minus room for an allocation's header.

@@ -82,7 +82,7 @@ def evaluate(
     ``ok`` is false. Summaries are computed from errors that are rounded to six significant digits. The results file is
     written after every row. A call with the same arguments, or with further solvers and data sets, continues the file.
     The file of any other evaluation is refused. A module of your own that has options needs ``config``, a dictionary of
-    the options or a function that returns it. Without ``config``, rows of other options are continued.
+    the options or a function that returns it. Without ``config``, rows that were measured with other options are kept.
 
     Args:
         solvers: solvers by name, called as ``solver(world_points, img_points, intrinsics)`` in evaluation mode without

@@ -51,8 +51,8 @@ class RANSAC(Initialiser):
     A pair is an inlier when :math:`\|r\|^2 < \tau^2 + (f \omega / z)^2`, see :mod:`kornia_pnpnet.judge.inliers`. In
     least squares, the weight of an inlier is :math:`\tau^2` divided by the right-hand side, without gradient. The final
     steps multiply this weight by that of a Cauchy kernel. The final steps start from a detached pose close to the
-    minimum, and have gradients with respect to points, pixels and weights. The choice of inliers has no gradient. Known
-    noise and priors of the pose do not weigh in least squares; a following refinement uses both.
+    minimum, and have gradients with respect to points, pixels and weights. The choice of inliers has no gradient.
+    Least squares use neither known noise nor priors of the pose. A following refinement uses both.
 
     Source: M. Fischler and R. Bolles, Communications of the ACM 24(6), 1981; O. Chum, J. Matas and J. Kittler,
     "Locally optimized RANSAC", DAGM 2003; P. Torr and A. Zisserman, CVIU 78(1), 2000 (MSAC); D. Nistér, "Preemptive

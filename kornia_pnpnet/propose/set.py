@@ -313,7 +313,7 @@ class SetInit(Initialiser):
         check_whole(0, len(_SAMPLES), samples=samples)
         self.samples = samples
         KORNIA_CHECK(width % heads == 0, f"heads must divide width, got {heads} and {width}.")
-        self.starts = starts
+        self.starts = int(starts)
         self.confidence = confidence
         self.repeats = repeats
         self.first = nn.Linear(_FEATURES + 2 * confidence + 2 * repeats, width)
