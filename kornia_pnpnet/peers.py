@@ -194,9 +194,8 @@ class RobustPeer(PeerSolver):
         super().__post_init__()
         check_positive(threshold=self.threshold)
         KORNIA_CHECK(0 < self.confidence < 1, f"confidence must lie in (0, 1), got {self.confidence}.")
-        counts = {name: value for name, value in self.config().items() if name.endswith("iterations")}
         check_whole(0, seed=self.seed)
-        check_whole(1, **counts)
+        check_whole(1, **{name: value for name, value in self.config().items() if name.endswith("iterations")})
 
 
 @dataclass(eq=False, kw_only=True)

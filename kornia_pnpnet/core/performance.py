@@ -135,6 +135,15 @@ def repeat_problems(tree: _T, count: int) -> _T:
     return map_tensors(lambda x: repeat(x) if x.ndim else x, tree)
 
 
+def kept_at_once(count: int, like: Tensor) -> int:
+    """Number of items that are computed at once: ``count`` on a CPU, because of its caches, else 64 times ``count``."""
+    return count if like.device.type == "cpu" else 64 * count
+
+
+# Size of an intermediate result that stays in the cache of one core.
+_CACHE_BYTES = 2**20
+
+
 def in_cache(
     function: Callable[..., _T], tensors: Sequence[Tensor], numbers: int, *, split: int = 0, join: int = 0
 ) -> _T:
@@ -163,9 +172,6 @@ def _last(x: Tensor) -> Tensor:
 def _reversed(x: Tensor) -> Tensor:
     return x.permute(tuple(reversed(range(x.ndim))))
 
-
-# Size of an intermediate result that stays in the cache of one core.
-_CACHE_BYTES = 2**20
 
 # Largest mmap threshold of glibc (32 MiB, see M_MMAP_THRESHOLD in mallopt(3)) minus room for an allocation's header.
 _LARGEST_KEPT = 2**25 - 2**16

@@ -29,9 +29,8 @@ from torch import Tensor
 from kornia_pnpnet.core.checks import check_devices, check_form, check_shapes, common_dtype
 from kornia_pnpnet.core.configured import Configured
 from kornia_pnpnet.core.linalg import signed
-from kornia_pnpnet.core.performance import compiling, fold_vmap, unfold_vmap
+from kornia_pnpnet.core.performance import compiling, fold_vmap, kept_at_once, unfold_vmap
 from kornia_pnpnet.problem import Hypotheses, Problem
-from kornia_pnpnet.propose.sampling import kept_at_once
 from kornia_pnpnet.propose.scoring import as_pose
 from kornia_pnpnet.refine.residual import MIN_DEPTH_RATIO
 from kornia_pnpnet.result import Pose

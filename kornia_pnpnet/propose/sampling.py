@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from kornia_pnpnet.core.performance import present_first
+from kornia_pnpnet.core.performance import kept_at_once, present_first
 from kornia_pnpnet.problem import Problem
 
-__all__ = ["Samples", "agreement_of_neighbours", "draw", "kept_at_once", "ranked", "samples_needed", "spread_evenly"]
+__all__ = ["Samples", "agreement_of_neighbours", "draw", "ranked", "samples_needed", "spread_evenly"]
 
 # The _NEIGHBOURS nearest neighbours of a pair are found among at most _CANDIDATES pairs. The cost is therefore linear
 # in the number of pairs. _CANDIDATES is a power of two because of the bit masks.
@@ -28,11 +28,6 @@ _GOLDEN = 0.6180339887
 # Pairs are ranked by u + _RANK[0] * v + _RANK[1] * d for a pixel (u, v) and the squared distance d of a point from the
 # origin. Different pairs rarely have the same sum.
 _RANK = 0.7548776662, 0.5698402910
-
-
-def kept_at_once(count: int, like: Tensor) -> int:
-    """Number of items that are computed at once: ``count`` on a CPU, because of its caches, else 64 times ``count``."""
-    return count if like.device.type == "cpu" else 64 * count
 
 
 @torch.no_grad()

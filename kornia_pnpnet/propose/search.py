@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from kornia_pnpnet.core.linalg import solve_positive
-from kornia_pnpnet.core.performance import compiling, present_first
+from kornia_pnpnet.core.performance import compiling, kept_at_once, present_first
 from kornia_pnpnet.core.trees import map_tensors, pairs_at, take
 from kornia_pnpnet.judge.evidence import pose_sigma
 from kornia_pnpnet.judge.inliers import Thresholds, judge, median_residual, residual_noise
 from kornia_pnpnet.problem import MIN_PAIRS, Problem, State
 from kornia_pnpnet.propose.minimal import MinimalSolver
 from kornia_pnpnet.propose.p3p_rig import P3PRig
-from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, kept_at_once, ranked
+from kornia_pnpnet.propose.sampling import Samples, agreement_of_neighbours, ranked
 from kornia_pnpnet.propose.scoring import Scene, Scorer, as_entries, as_pose
 from kornia_pnpnet.refine.residual import Projection, moved, normal_equations, project
 from kornia_pnpnet.refine.terms import add_term
